@@ -148,7 +148,7 @@ def _is_said(key: str, value: Any) -> bool:
 
 def _metric(facts: Mapping[str, Any]) -> MetricInfo:
     """Return a metric as ``run.json`` holds it; facts that this version does not know are left out."""
-    known = {key: tuple(value) if key == "limits" else value for key, value in facts.items() if key in _FIELDS}
+    known: dict[str, Any] = {key: tuple(value) if key == "limits" else value for key, value in facts.items() if key in _FIELDS}
     return MetricInfo(**known)
 
 

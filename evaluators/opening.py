@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -30,7 +29,7 @@ def read_run(run_dir: Path | str) -> Run:
     return Run.of(reader.read_run(run_dir))
 
 
-def read_so_far(root: Path) -> RunSoFar:
+def read_so_far(root: Path) -> RunSoFar[Run]:
     """Read a run folder that may still be written; see `alpasim_plugin.run_folder.reader.read_so_far`."""
     found = reader.read_so_far(root)
-    return replace(found, run=Run.of(found.run))
+    return RunSoFar(Run.of(found.run), found.planned, found.damage, found.finished)

@@ -41,14 +41,14 @@ class EgoSpec(Part):
 class EnvironmentSpec(Part):
     """Surroundings generated beside the road."""
 
-    buildings: float = Field(0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
+    buildings: float = Field(default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
     building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
         default=(6.0, 18.0), description="Least and greatest height of facades."
     )
     trees_per_100m: float = within(b.TREES_PER_100M, "Trees per road side.", 4.0)
-    poles_spacing_m: float = Field(30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none.")
-    sky: Literal["clear", "overcast", "dusk"] = Field("clear", description="Sky and light.")
-    texture: float = Field(1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
+    poles_spacing_m: float = Field(default=30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none.")
+    sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
+    texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
@@ -62,15 +62,15 @@ class EnvironmentSpec(Part):
 class CameraModel(Part):
     """A pinhole camera on the rig."""
 
-    name: str = Field("front", min_length=1, description="Name that policies request.")
+    name: str = Field(default="front", min_length=1, description="Name that policies request.")
     width: int = within(b.IMAGE_SIDE_PX, "Image width in pixels.", 256)
     height: int = within(b.IMAGE_SIDE_PX, "Image height in pixels.", 144)
-    hfov_deg: float = Field(75.0, gt=1, lt=170, description="Horizontal field of view.")
+    hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
     x_m: float = within(b.MOUNT_M, "Mount, metres ahead of the rear axle.", 1.6)
     y_m: float = within(b.MOUNT_M, "Mount, metres to the left.", 0.0)
-    z_m: float = Field(1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground.")
-    yaw_deg: float = Field(0.0, ge=-180, le=180, description="Turned to the left.")
-    pitch_down_deg: float = Field(4.0, gt=-90, lt=90, description="Tilted downwards.")
+    z_m: float = Field(default=1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground.")
+    yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
+    pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
     shutter_us: int = within(b.SHUTTER_US, "Exposure from shutter start to shutter end.", 0)
 
 
@@ -108,9 +108,9 @@ class TimingSpec(Part):
 class LatencySpec(Part):
     """Delay from observation to the plan taking effect."""
 
-    kind: Literal["none", "fixed", "measured"] = Field("none", description="No delay, a fixed one, or the measured one.")
+    kind: Literal["none", "fixed", "measured"] = Field(default="none", description="No delay, a fixed one, or the measured one.")
     fixed_us: int = within(b.TIME_US, "Delay where kind is fixed.", 0)
-    fixer: bool = Field(False, description="Where kind is measured: the policy also waits for the fixer of its frames.")
+    fixer: bool = Field(default=False, description="Where kind is measured: the policy also waits for the fixer of its frames.")
 
     @model_validator(mode="after")
     def _fitting(self) -> LatencySpec:
@@ -126,14 +126,14 @@ class DegradationSpec(Part):
         default="reconstruction",
         description="A model fitted to the logged drive and stopped early; one fitted to views beside it; seeded perturbations; none.",
     )
-    share: float = Field(0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
-    shift_m: float = Field(1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
-    views_per_s: float = Field(6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
-    depth_error: float = Field(0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
-    pose_error_m: float = Field(0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
-    severity: float = Field(1.5, ge=0, le=100, description="Surrogate: scales all terms; 0 leaves the scene as built.")
+    share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
+    shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
+    views_per_s: float = Field(default=6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
+    depth_error: float = Field(default=0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
+    pose_error_m: float = Field(default=0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
+    severity: float = Field(default=1.5, ge=0, le=100, description="Surrogate: scales all terms; 0 leaves the scene as built.")
     onset_m: float = within(b.GAP_M, "Surrogate: distance from the logged path where the error starts to grow.", 0.1)
-    full_m: float = Field(2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full.")
+    full_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full.")
 
     @model_validator(mode="after")
     def _fitting(self) -> DegradationSpec:
@@ -162,7 +162,7 @@ class BackgroundSpec(Part):
     transform: tuple[tuple[float, float, float, float], ...] | None = Field(
         default=None, min_length=4, max_length=4, description="4 x 4 matrix from the file's frame to the world, row by row; may scale."
     )
-    keep_road: bool = Field(False, description="Draw the built road with the file; otherwise the file replaces road and houses.")
+    keep_road: bool = Field(default=False, description="Draw the built road with the file; otherwise the file replaces road and houses.")
 
 
 class VehicleSpec(Part):
@@ -173,7 +173,7 @@ class VehicleSpec(Part):
     height_m: float = within(b.VEHICLE_M, "Body height.", 1.6)
     rear_axle_to_centre_m: float = within(b.AXLE_M, "From the rear axle forwards to the body's middle.", 1.4)
     wheelbase_m: float = within(b.VEHICLE_M, "Distance between the axles.", 2.85)
-    max_steer_rad: float = Field(0.6, ge=b.STEER_RAD.low, lt=b.STEER_RAD.high, description="Largest road-wheel angle.")
+    max_steer_rad: float = Field(default=0.6, ge=b.STEER_RAD.low, lt=b.STEER_RAD.high, description="Largest road-wheel angle.")
     max_steer_rate_radps: float = within(b.STEER_RATE_RADPS, "Largest steering rate.", 0.8)
     max_accel_mps2: float = within(b.ACCEL_MPS2, "Largest acceleration.", 3.5)
     max_brake_mps2: float = within(b.ACCEL_MPS2, "Largest deceleration.", 8.0)
@@ -182,11 +182,11 @@ class VehicleSpec(Part):
 class JitterSpec(Part):
     """Ranges within which scenes of other seeds than 0 differ from the file; 0 switches a term off. Uniform, relative unless in a unit."""
 
-    length: float = Field(0.05, ge=0, le=0.5, description="Relative change of element lengths.")
-    curvature: float = Field(0.1, ge=0, le=0.5, description="Relative change of curvatures.")
-    lane_width: float = Field(0.02, ge=0, le=0.2, description="Relative change of the lane width.")
-    speed: float = Field(0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
-    position_m: float = Field(1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
+    length: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of element lengths.")
+    curvature: float = Field(default=0.1, ge=0, le=0.5, description="Relative change of curvatures.")
+    lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Relative change of the lane width.")
+    speed: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
+    position_m: float = Field(default=1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
     time_us: int = within(b.TIME_US, "Shift of scripted moments, each way.", 150_000)
 
 
@@ -219,26 +219,26 @@ class ScenarioSpec(Part):
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$",
         description="Name of the scene; none: the file's folder and name.",
     )
-    description: str = Field("", description="One sentence.")
-    tags: tuple[str, ...] = Field((), max_length=int(b.LISTED.high), description="Keywords.")
+    description: str = Field(default="", description="One sentence.")
+    tags: tuple[str, ...] = Field(default=(), max_length=int(b.LISTED.high), description="Keywords.")
     seed: int = Field(
         default=0, ge=0, le=int(b.SEED.high), description="Scene seed; 0: the numbers are used as written, others jitter them."
     )
-    road: RoadSpec | None = Field(None, description="A road to build; give this or log.")
-    log: LogSpec | None = Field(None, description="A recorded drive to use; give this or road.")
-    ego: EgoSpec = Field(EgoSpec(), description="The expert that drives a built road.")
-    actors: tuple[ActorSpec, ...] = Field((), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users.")
-    environment: EnvironmentSpec = Field(EnvironmentSpec(), description="Surroundings.")
+    road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
+    log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
+    ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
+    actors: tuple[ActorSpec, ...] = Field(default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users.")
+    environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
     cameras: tuple[CameraModel, ...] | None = Field(
         default=None, min_length=1, max_length=int(b.CAMERAS.high), description="Cameras; none: the log's own, or one named front."
     )
-    rates: RatesSpec = Field(RatesSpec(), description="Periods of the loop.")
-    timing: TimingSpec = Field(TimingSpec(), description="Start, length and warm-up.")
-    latency: LatencySpec = Field(LatencySpec(), description="Delay of the policy.")
-    degradation: DegradationSpec = Field(DegradationSpec(), description="Degradation of the renderer 3dgs.")
-    background: BackgroundSpec | None = Field(None, description="A Gaussian file as background.")
-    vehicle: VehicleSpec | None = Field(None, description="The ego vehicle; none: the log's own, or the default one.")
-    jitter: JitterSpec = Field(JitterSpec(), description="How scenes of other seeds than 0 differ from the file.")
+    rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
+    timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
+    latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
+    degradation: DegradationSpec = Field(default=DegradationSpec(), description="Degradation of the renderer 3dgs.")
+    background: BackgroundSpec | None = Field(default=None, description="A Gaussian file as background.")
+    vehicle: VehicleSpec | None = Field(default=None, description="The ego vehicle; none: the log's own, or the default one.")
+    jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of other seeds than 0 differ from the file.")
     variations: dict[str, RangeSpec | ChoiceSpec] = Field(
         default={}, description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed."
     )

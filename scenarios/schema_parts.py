@@ -75,13 +75,13 @@ class IntersectionSegment(Part):
     """A junction; the road goes on by ``turn``."""
 
     kind: Literal["intersection"]
-    turn: Turn = Field("straight", description="Where the road goes on.")
-    arms: tuple[Turn, ...] = Field(("left", "straight", "right"), min_length=1, description="Arms seen from the entry.")
-    cross_lanes: int = Field(1, ge=1, le=4, description="Lanes per direction on the arms beside the road.")
-    arm_length_m: float = Field(40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms.")
-    corner_radius_m: float = Field(8.0, ge=3, le=40, description="Size of the kerb's corners.")
-    crosswalks: bool = Field(True, description="Crosswalks on every arm.")
-    guide_lines: bool = Field(True, description="Dashed lines through the junction along the road.")
+    turn: Turn = Field(default="straight", description="Where the road goes on.")
+    arms: tuple[Turn, ...] = Field(default=("left", "straight", "right"), min_length=1, description="Arms seen from the entry.")
+    cross_lanes: int = Field(default=1, ge=1, le=4, description="Lanes per direction on the arms beside the road.")
+    arm_length_m: float = Field(default=40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms.")
+    corner_radius_m: float = Field(default=8.0, ge=3, le=40, description="Size of the kerb's corners.")
+    crosswalks: bool = Field(default=True, description="Crosswalks on every arm.")
+    guide_lines: bool = Field(default=True, description="Dashed lines through the junction along the road.")
 
 
 class NarrowGapSegment(Part):
@@ -89,10 +89,10 @@ class NarrowGapSegment(Part):
 
     kind: Literal["narrow_gap"]
     length_m: float = within(b.SEGMENT_M, "Length of the straight; the cars stand in its middle half.", 40.0)
-    gap_m: float = Field(3.0, gt=2.0, le=8, description="Free width between the rows of parked cars.")
-    shift_m: float = Field(0.0, ge=-3, le=3, description="The gap's middle, metres left of the ego lane's middle.")
-    cars_left: int = Field(2, ge=0, le=8, description="Parked cars on the left.")
-    cars_right: int = Field(2, ge=0, le=8, description="Parked cars on the right.")
+    gap_m: float = Field(default=3.0, gt=2.0, le=8, description="Free width between the rows of parked cars.")
+    shift_m: float = Field(default=0.0, ge=-3, le=3, description="The gap's middle, metres left of the ego lane's middle.")
+    cars_left: int = Field(default=2, ge=0, le=8, description="Parked cars on the left.")
+    cars_right: int = Field(default=2, ge=0, le=8, description="Parked cars on the right.")
 
 
 SEGMENT_KINDS: dict[str, type[Part]] = {
@@ -114,14 +114,14 @@ SegmentSpec = Annotated[
 class RoadSpec(Part):
     """A road built from segments that follow one another along the ego's path. Driving is on the right."""
 
-    lanes_forward: int = Field(1, ge=1, le=6, description="Lanes in the ego's direction at the start.")
-    lanes_backward: int = Field(1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
-    lane_width_m: float = Field(3.5, ge=2.2, le=6, description="Width of every lane.")
-    median_m: float = Field(0.0, ge=0, le=30, description="Raised median between the directions; 0: markings only.")
-    shoulder_m: float = Field(0.5, ge=0, le=6, description="Paved strip outside the outer lanes.")
-    parking_m: float = Field(0.0, ge=0, le=6, description="Parking strip outside the outer lanes, instead of the shoulder.")
+    lanes_forward: int = Field(default=1, ge=1, le=6, description="Lanes in the ego's direction at the start.")
+    lanes_backward: int = Field(default=1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
+    lane_width_m: float = Field(default=3.5, ge=2.2, le=6, description="Width of every lane.")
+    median_m: float = Field(default=0.0, ge=0, le=30, description="Raised median between the directions; 0: markings only.")
+    shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the outer lanes.")
+    parking_m: float = Field(default=0.0, ge=0, le=6, description="Parking strip outside the outer lanes, instead of the shoulder.")
     speed_limit_mps: float | None = within(b.LIMIT_MPS, "Speed limit of all lanes.", None)
-    centre_paint: CentrePaint = Field("double_yellow", description="Line between the directions.")
+    centre_paint: CentrePaint = Field(default="double_yellow", description="Line between the directions.")
     heading_deg: float = within(b.ANGLE_DEG, "Direction of the road's beginning, from east to the left.", 0.0)
     segments: tuple[SegmentSpec, ...] = Field(min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order.")
 
@@ -132,16 +132,16 @@ SHIPPED = ("argoverse", "commonroad", "cosmos", "usdz")
 class LogSpec(Part):
     """A recorded drive. Exactly one of the sources is given; relative paths start at this file's folder."""
 
-    argoverse: str | None = Field(None, min_length=1, description="Folder of one Argoverse 2 log.")
-    commonroad: str | None = Field(None, min_length=1, description="CommonRoad XML file.")
-    cosmos: str | None = Field(None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip.")
-    usdz: str | None = Field(None, min_length=1, description="AlpaSim scene file.")
+    argoverse: str | None = Field(default=None, min_length=1, description="Folder of one Argoverse 2 log.")
+    commonroad: str | None = Field(default=None, min_length=1, description="CommonRoad XML file.")
+    cosmos: str | None = Field(default=None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip.")
+    usdz: str | None = Field(default=None, min_length=1, description="AlpaSim scene file.")
     source: str | None = Field(
         default=None, min_length=1, description="A source of an installed package, or package.module:Class; it reads path."
     )
-    path: str | None = Field(None, min_length=1, description="File or folder that source reads.")
-    ego: int | str | None = Field(None, description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.")
-    actors: Literal["replay", "idm", "none"] = Field("replay", description="Replay the recorded traffic, let it react, or drop it.")
+    path: str | None = Field(default=None, min_length=1, description="File or folder that source reads.")
+    ego: int | str | None = Field(default=None, description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.")
+    actors: Literal["replay", "idm", "none"] = Field(default="replay", description="Replay the recorded traffic, let it react, or drop it.")
 
     @model_validator(mode="after")
     def _one(self) -> LogSpec:
@@ -167,8 +167,8 @@ ActorId = Annotated[str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_
 
 class _Actor(Part):
     id: ActorId
-    label: Label = Field("car", description="Class of road user.")
-    size_m: tuple[Side, Side, Side] | None = Field(None, description="Length, width, height; none: as usual.")
+    label: Label = Field(default="car", description="Class of road user.")
+    size_m: tuple[Side, Side, Side] | None = Field(default=None, description="Length, width, height; none: as usual.")
 
 
 class _InLane(_Actor):
@@ -184,11 +184,11 @@ class ParkedActor(_Actor):
 
     kind: Literal["parked"]
     s_m: float = within(b.STATION_M, "Centre, metres along the road from the ego's start.")
-    side: Literal["left", "right"] = Field("right", description="Side of the road.")
+    side: Literal["left", "right"] = Field(default="right", description="Side of the road.")
     clearance_m: float = within(b.OFFSET_M, "From the outer lane's edge to the body; negative: it stands in the lane.", 0.3)
-    count: int = Field(1, ge=1, le=40, description="Vehicles in the row.")
+    count: int = Field(default=1, ge=1, le=40, description="Vehicles in the row.")
     spacing_m: float = within(b.SPACING_M, "Distance between their centres.", 7.0)
-    yaw_deg: float = Field(0.0, ge=-180, le=180, description="Turned to the left against the lane.")
+    yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left against the lane.")
 
 
 class LoggedActor(_Actor):
@@ -216,7 +216,7 @@ class IdmActor(_InLane):
     speed_mps: float = within(b.SPEED_MPS, "Speed at the start.")
     desired_speed_mps: float | None = within(b.CRUISE_MPS, "Desired speed; none: the speed at the start, at least 1.", None)
     headway_s: float = within(b.HEADWAY_S, "Time gap.", 1.5)
-    min_gap_m: float = Field(2.0, gt=0, le=b.GAP_M.high, description="Gap at standstill.")
+    min_gap_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Gap at standstill.")
     accel_mps2: float = within(b.ACCEL_MPS2, "Acceleration.", 1.5)
     brake_mps2: float = within(b.ACCEL_MPS2, "Comfortable deceleration.", 2.0)
 
@@ -255,7 +255,7 @@ class HardBrakeActor(_InLane):
     kind: Literal["hard_brake"]
     speed_mps: float = within(b.CRUISE_MPS, "Speed before braking.")
     brake_at_us: int = within(b.TIME_US, "Start of braking after the log's start.")
-    decel_mps2: float = Field(6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
+    decel_mps2: float = Field(default=6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
     end_speed_mps: float = within(b.SPEED_MPS, "Speed after braking.", 0.0)
     resume_at_us: int | None = within(b.TIME_US, "When it accelerates again to its first speed; none: never.", None)
 
@@ -277,7 +277,7 @@ class CutInActor(_Actor):
     s_m: float = within(b.STATION_M, "Centre at the start, metres along the road from the ego's start.")
     speed_mps: float = within(b.CRUISE_MPS, "Speed.")
     at_us: int = within(b.TIME_US, "Start of the lateral motion after the log's start.")
-    change_us: int = Field(2_500_000, ge=b.PERIOD_US.low, le=b.TIME_US.high, description="Duration of the lateral motion.")
+    change_us: int = Field(default=2_500_000, ge=b.PERIOD_US.low, le=b.TIME_US.high, description="Duration of the lateral motion.")
     end_speed_mps: float | None = within(b.SPEED_MPS, "Speed afterwards; none: the same.", None)
     decel_mps2: float = within(b.ACCEL_MPS2, "How fast the speed changes after the lateral motion has begun.", 2.0)
 
@@ -292,9 +292,9 @@ class CrossingActor(_Actor):
     """A pedestrian (or cyclist) who crosses, timed against the ego."""
 
     kind: Literal["crossing_pedestrian"]
-    label: Label = Field("pedestrian", description="Class of road user.")
+    label: Label = Field(default="pedestrian", description="Class of road user.")
     s_m: float = within(b.STATION_M, "Place of crossing, metres along the road from the ego's start.")
-    side: Literal["left", "right"] = Field("right", description="Side that the crossing starts from.")
+    side: Literal["left", "right"] = Field(default="right", description="Side that the crossing starts from.")
     speed_mps: float = within(b.CRUISE_MPS, "Walking speed.", 1.4)
     before_ego_s: float = Field(
         default=1.0,

@@ -72,7 +72,7 @@ def runs(
     found = find_runs(places, bool(metric) or steps or page is not None)
     taken, lost = chosen(found, choice)
     taken = taken[:last]
-    names = _metrics(metric or [], taken)
+    names = _metrics(metric, taken)
     if steps or page is not None:
         _trend(taken, names or list(METRICS.headline), places, page, as_json)
         _say(lost)
@@ -128,14 +128,14 @@ def _trend(entries: Sequence[RunEntry], metrics: Sequence[str], places: Sequence
         print(f"left out  {shown_folder(entry.folder, places)}: {why}")
 
 
-def _states(asked: list[str]) -> tuple[State, ...]:
+def _states(asked: Sequence[str]) -> tuple[State, ...]:
     strange = [one for one in asked if one not in STATES]
     if strange:
         raise InputError(DOING, f"--state {strange[0]}", "no such state", f"name one of {', '.join(STATES)}")
     return tuple(one for one in STATES if one in asked)
 
 
-def _metrics(asked: list[str], entries: list[RunEntry]) -> list[str]:
+def _metrics(asked: Sequence[str], entries: list[RunEntry]) -> list[str]:
     """Return the metrics to show; refuse one that neither simrun nor any of the runs knows."""
     strange = [name for name in asked if name not in METRICS]
     seen = {name for entry in entries for table in (entry.summary.get("metrics") or {}).values() for name in table} if strange else set()
@@ -144,7 +144,7 @@ def _metrics(asked: list[str], entries: list[RunEntry]) -> list[str]:
             near = difflib.get_close_matches(name, {*METRICS, *seen}, 1)
             hint = f"did you mean {near[0]}? " if near else ""
             raise InputError(DOING, f"--metric {name}", "no such metric", f"{hint}simrun list metrics names those that ship")
-    return asked
+    return list(asked)
 
 
 def _values(entry: RunEntry, names: list[str]) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -195,8 +195,11 @@ class Run:
         return {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
 
 
+RunT = TypeVar("RunT", bound=Run)
+
+
 @dataclass(frozen=True)
-class RunSoFar:
+class RunSoFar(Generic[RunT]):
     """A run as far as it has got.
 
     Attributes:
@@ -206,7 +209,7 @@ class RunSoFar:
         finished: All of it is written, tables and reports too.
     """
 
-    run: Run
+    run: RunT
     planned: int
     damage: tuple[str, ...]
     finished: bool
@@ -242,7 +245,7 @@ def read_run(run_dir: Path | str) -> Run:
     return Run(folder, info, summary, StoredRollouts(path), metrics_in(ROLLOUTS_TABLE.check(path)))
 
 
-def read_so_far(root: Path) -> RunSoFar:
+def read_so_far(root: Path) -> RunSoFar[Run]:
     """Read a run folder that may still be written: a manifest is written last, so a rollout that has one is whole.
 
     Raises:

@@ -20,6 +20,7 @@ from alpasim_plugin.viewer.budget import as_json
 from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted
 from alpasim_plugin.viewer.page import Options, render
 from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
+from evaluators.opening import Run
 
 DOING = "serving a run"
 LEAST_AGE_S = 1.0  # the folder is not looked through more often than this,
@@ -87,12 +88,12 @@ class RunServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, address: tuple[str, int], read: Callable[[], RunSoFar], wanted: Wanted, options: Options) -> None:
+    def __init__(self, address: tuple[str, int], read: Callable[[], RunSoFar[Run]], wanted: Wanted, options: Options) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         self._read, self._wanted, self._options = read, wanted, options
         self._lock = threading.Lock()
-        self._seen: tuple[float, RunSoFar] | None = None  # until when it is young enough
+        self._seen: tuple[float, RunSoFar[Run]] | None = None  # until when it is young enough
         check_wanted(self.seen().run, wanted)
         self.root = self.seen().run.folder.resolve()
         try:
@@ -112,7 +113,7 @@ class RunServer(ThreadingHTTPServer):
         """Give the values of the header Host that are answered: a page of another name that resolves to this machine is not."""
         return frozenset(f"{name}:{self.server_address[1]}" for name in ("localhost", "127.0.0.1", "[::1]", urlsplit(self.url).hostname))
 
-    def seen(self) -> RunSoFar:
+    def seen(self) -> RunSoFar[Run]:
         """Return the run as it was a moment ago."""
         with self._lock:
             if self._seen is None or time.monotonic() >= self._seen[0]:

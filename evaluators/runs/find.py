@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.runs.entry import CONTENTS, DOING, LOCK, RUN_INFO, RunEntry, read_entry
+from alpasim_plugin.run_folder.schema import CONTENTS, LOCK, RUN_INFO
+from evaluators.runs.entry import DOING, RunEntry, read_entry
 
 MARKS = frozenset((RUN_INFO, CONTENTS, LOCK))  # the first file of a run folder is its lock
 SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))

@@ -185,7 +185,8 @@ class _Lens(NamedTuple):
         if not self.distortion.any():
             return self.K
         whole, _ = cv2.getOptimalNewCameraMatrix(self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0)
-        return np.asarray(whole, dtype=np.float64) + _FROM_CORNER
+        straight: F64 = np.asarray(whole, dtype=np.float64) + _FROM_CORNER
+        return straight
 
     def straightened(self, image: U8) -> U8:
         """Return an image freed of the distortion."""

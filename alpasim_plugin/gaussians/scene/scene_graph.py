@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool
@@ -71,7 +72,7 @@ def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     return {int(i): cloud.take(part) for i, part in zip(ids, np.split(order, first[1:]), strict=True)}
 
 
-def tile_numbers(xy: F64, size_m: float, row: int = 100_000) -> I64:
+def tile_numbers(xy: npt.NDArray[np.floating], size_m: float, row: int = 100_000) -> I64:
     """Return the number ``(N,)`` of the square tile in which each point ``(N, 2)`` lies; ``row`` more from one row of tiles to the next."""
     tile = np.floor(xy / size_m).astype(np.int64)
     return np.asarray(tile[:, 1] * row + tile[:, 0])
