@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SHIFT = 5.0
 TABLE = 1000

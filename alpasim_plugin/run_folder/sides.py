@@ -41,7 +41,7 @@ def _entry_of(metrics: Mapping[str, Any], metric: str) -> tuple[Any, Any, Any]:
     if entry is None:
         return None, False, ""
     facts = entry if isinstance(entry, Mapping) else vars(entry)
-    return facts["value"], facts["valid"], facts["reason"]
+    return facts["value"], facts["valid"], facts.get("reason", "")
 
 
 def failure_of(row: Row) -> str:

@@ -31,7 +31,7 @@ class Settings(BaseModel):
 class Mine(with_me.Base):
     settings_model = Settings
 """
-BASE = "from policies.constant_velocity import ConstantVelocity as Base\n"
+BASE = "from policies.simple import ConstantVelocity as Base\n"
 
 
 @pytest.fixture
