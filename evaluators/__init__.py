@@ -11,25 +11,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.lazy import lazy_names
-from evaluators.aggregate.summary import aggregate  # not on first use: its package bears the same name
 
 if TYPE_CHECKING:
-    from evaluators.aggregate.censoring import censoring as censoring
-    from evaluators.aggregate.paired import paired as paired
-    from evaluators.aggregate.reduce import Reduction as Reduction
-    from evaluators.aggregate.reduce import RolloutValue as RolloutValue
-    from evaluators.aggregate.reduce import reduce_rollout as reduce_rollout
-    from evaluators.aggregate.reduce import rollout_values as rollout_values
-    from evaluators.base import resolve_evaluators as resolve_evaluators
-    from evaluators.base import score as score
-    from evaluators.base import series as series
-    from evaluators.collision import ContactEvent as ContactEvent
-    from evaluators.collision import contact_events as contact_events
     from evaluators.metrics import METRICS as METRICS
     from evaluators.metrics import MetricInfo as MetricInfo
-    from evaluators.presets import PRESETS as PRESETS
-    from evaluators.presets import Preset as Preset
-    from evaluators.presets import preset as preset
+    from evaluators.metrics.collision import ContactEvent as ContactEvent
+    from evaluators.metrics.collision import contact_events as contact_events
+    from evaluators.metrics.presets import PRESETS as PRESETS
+    from evaluators.metrics.presets import Preset as Preset
+    from evaluators.metrics.presets import preset as preset
+    from evaluators.metrics.score import resolve_evaluators as resolve_evaluators
+    from evaluators.metrics.score import score as score
+    from evaluators.metrics.score import series as series
+    from evaluators.statistics.paired import paired as paired
+    from evaluators.statistics.reduce import Reduction as Reduction
+    from evaluators.statistics.reduce import RolloutValue as RolloutValue
+    from evaluators.statistics.reduce import reduce_rollout as reduce_rollout
+    from evaluators.statistics.reduce import rollout_values as rollout_values
+    from evaluators.statistics.summary import aggregate as aggregate
+    from evaluators.statistics.summary import censoring as censoring
 
 __all__ = [
     "METRICS",
@@ -54,21 +54,22 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "ContactEvent": ".collision",
+        "ContactEvent": ".metrics.collision",
         "METRICS": ".metrics",
         "MetricInfo": ".metrics",
-        "PRESETS": ".presets",
-        "Preset": ".presets",
-        "Reduction": ".aggregate.reduce",
-        "RolloutValue": ".aggregate.reduce",
-        "censoring": ".aggregate.censoring",
-        "contact_events": ".collision",
-        "paired": ".aggregate.paired",
-        "preset": ".presets",
-        "reduce_rollout": ".aggregate.reduce",
-        "resolve_evaluators": ".base",
-        "rollout_values": ".aggregate.reduce",
-        "score": ".base",
-        "series": ".base",
+        "PRESETS": ".metrics.presets",
+        "Preset": ".metrics.presets",
+        "Reduction": ".statistics.reduce",
+        "RolloutValue": ".statistics.reduce",
+        "aggregate": ".statistics.summary",
+        "censoring": ".statistics.summary",
+        "contact_events": ".metrics.collision",
+        "paired": ".statistics.paired",
+        "preset": ".metrics.presets",
+        "reduce_rollout": ".statistics.reduce",
+        "resolve_evaluators": ".metrics.score",
+        "rollout_values": ".statistics.reduce",
+        "score": ".metrics.score",
+        "series": ".metrics.score",
     },
 )

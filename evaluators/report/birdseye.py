@@ -16,8 +16,8 @@ import numpy.typing as npt
 import shapely
 
 from alpasim_plugin.run_folder.rows import Rollout, Series
-from evaluators.report.events import Event, clock_zero_us, events_of
 from evaluators.report.numbers import fixed
+from evaluators.report.rollouts import Event, clock_zero_us, events_of
 
 F64 = npt.NDArray[np.float64]
 Variants = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)

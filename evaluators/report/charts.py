@@ -22,8 +22,8 @@ from alpasim_plugin.run_folder.rows import Rollout, Series
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
-from evaluators.report.events import events_of
 from evaluators.report.numbers import LEAST_SPAN, finite, interval
+from evaluators.report.rollouts import events_of
 
 N_COLOURS = 8
 SIZE_IN = (4.6, 2.7)  # about 440 x 260 CSS pixels: legible at its own size on a phone

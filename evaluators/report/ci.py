@@ -13,14 +13,13 @@ from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Rollout
-from evaluators.gate.judge import Check, GateVerdict
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
-from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell, plural
-from evaluators.report.provenance import provenance
+from evaluators.report.provenance import LEDGER_COLUMNS, failure_rows, ledger, provenance
+from evaluators.statistics.gate import Check, GateVerdict
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
 CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"

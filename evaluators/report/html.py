@@ -23,15 +23,12 @@ from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import section
-from evaluators.report.events import COLLISION, read_series
-from evaluators.report.every_rollout import rollout_block
-from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.flips import baseline_of, flip_rows
-from evaluators.report.frames import comparisons
+from evaluators.report.flips import baseline_of, comparisons, flip_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
-from evaluators.report.provenance import certificate, provenance
+from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
+from evaluators.report.rollouts import COLLISION, read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
-from evaluators.aggregate.intervals import clustered
 from evaluators.metrics import METRICS
 from evaluators.opening import Run
 from evaluators.report.charts import GRID, MARKERS, N_COLOURS, RC, VARIANT, Chart, new_axes, themed_svg
-from evaluators.report.events import COLLISION
 from evaluators.report.numbers import Cell, fixed, missing, plural, short
+from evaluators.report.rollouts import COLLISION
+from evaluators.statistics.intervals import clustered
 
 DISTANCE, OPACITY = "lateral_bias_m", "opacity_mean"
 DISTANCE_EDGES_M = (0.25, 0.5, 1.0, 2.0)

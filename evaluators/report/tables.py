@@ -12,7 +12,6 @@ from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.opening import Run
-from evaluators.report.events import COLLISION
 from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
@@ -29,6 +28,7 @@ from evaluators.report.numbers import (
     plural,
     short,
 )
+from evaluators.report.rollouts import COLLISION
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from alpasim_plugin.run_folder import columns
 from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.sides import RendererRows
 from evaluators import aggregate, paired
-from evaluators.aggregate.overall import numbers
-from evaluators.aggregate.paired import base_pairs
-from evaluators.gate import GateSpec, judge, judge_table
+from evaluators.statistics.gate import GateSpec, judge, judge_table
+from evaluators.statistics.paired import base_pairs
+from evaluators.statistics.summary import numbers
 
 METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacle_m")
 KEYS = ("renderer", "policy", "scene", "seed", "status", "failure_class")

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from scipy import optimize
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.sequential import asymptotic, betting, line
-from evaluators.sequential.control import RIDGE, Control, adjusted_draws, of_families, of_rows, predictions
-from evaluators.sequential.draws import Draws, independent, without_replacement
-from evaluators.sequential.line import relative_slope
-from evaluators.sequential.multiplicity import closed, closed_by_sets
-from evaluators.sequential.plan import LEAST_SLOPE, USUAL_SLOPE, Plan
-from evaluators.sequential.question import metric_question
+from evaluators.statistics.sequential import asymptotic, betting, line
+from evaluators.statistics.sequential.control import RIDGE, Control, adjusted_draws, of_families, of_rows, predictions
+from evaluators.statistics.sequential.decision import closed, closed_by_sets
+from evaluators.statistics.sequential.draws import Draws, independent, without_replacement
+from evaluators.statistics.sequential.line import LEAST_SLOPE, USUAL_SLOPE, Plan, relative_slope
+from evaluators.statistics.sequential.question import metric_question
 
 PLAN = Plan(0.1, 50, 0.05)
 

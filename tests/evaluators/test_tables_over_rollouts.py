@@ -10,8 +10,8 @@ from scipy import stats
 
 from alpasim_plugin.core.errors import InputError
 from evaluators import aggregate, censoring, paired
-from evaluators.aggregate.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
-from evaluators.aggregate.paired import base_pairs
+from evaluators.statistics.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
+from evaluators.statistics.paired import base_pairs
 
 
 def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):

@@ -15,10 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
-from evaluators.aggregate import aggregate, censoring, paired
-from evaluators.aggregate.paired import base_pairs
 from evaluators.opening import read_run
 from evaluators.report.flips import find_flips
+from evaluators.statistics.paired import base_pairs, paired
+from evaluators.statistics.summary import aggregate, censoring
 
 METRICS = (
     "collision_any",
