@@ -13,63 +13,26 @@ from typing import TYPE_CHECKING
 from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from evaluators.metrics import METRICS as METRICS
-    from evaluators.metrics import MetricInfo as MetricInfo
-    from evaluators.metrics.collision import ContactEvent as ContactEvent
-    from evaluators.metrics.collision import contact_events as contact_events
-    from evaluators.metrics.presets import PRESETS as PRESETS
-    from evaluators.metrics.presets import Preset as Preset
-    from evaluators.metrics.presets import preset as preset
-    from evaluators.metrics.score import resolve_evaluators as resolve_evaluators
-    from evaluators.metrics.score import score as score
-    from evaluators.metrics.score import series as series
-    from evaluators.statistics.paired import paired as paired
-    from evaluators.statistics.reduce import Reduction as Reduction
-    from evaluators.statistics.reduce import RolloutValue as RolloutValue
-    from evaluators.statistics.reduce import reduce_rollout as reduce_rollout
-    from evaluators.statistics.reduce import rollout_values as rollout_values
-    from evaluators.statistics.summary import aggregate as aggregate
-    from evaluators.statistics.summary import censoring as censoring
+    from evaluators.metrics import METRICS, MetricInfo
+    from evaluators.metrics.collision import ContactEvent, contact_events
+    from evaluators.metrics.presets import PRESETS, Preset, preset
+    from evaluators.metrics.score import resolve_evaluators, score, series
+    from evaluators.statistics.paired import paired
+    from evaluators.statistics.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
+    from evaluators.statistics.summary import aggregate, censoring
 
 __all__ = [
-    "METRICS",
-    "PRESETS",
-    "ContactEvent",
-    "MetricInfo",
-    "Preset",
-    "Reduction",
-    "RolloutValue",
-    "aggregate",
-    "censoring",
-    "contact_events",
-    "paired",
-    "preset",
-    "reduce_rollout",
-    "resolve_evaluators",
-    "rollout_values",
-    "score",
-    "series",
-]
+    "METRICS", "PRESETS", "ContactEvent", "MetricInfo", "Preset", "Reduction", "RolloutValue", "aggregate", "censoring", "contact_events",
+    "paired", "preset", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series",
+]  # fmt: skip
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "ContactEvent": ".metrics.collision",
-        "METRICS": ".metrics",
-        "MetricInfo": ".metrics",
-        "PRESETS": ".metrics.presets",
-        "Preset": ".metrics.presets",
-        "Reduction": ".statistics.reduce",
-        "RolloutValue": ".statistics.reduce",
-        "aggregate": ".statistics.summary",
-        "censoring": ".statistics.summary",
-        "contact_events": ".metrics.collision",
-        "paired": ".statistics.paired",
-        "preset": ".metrics.presets",
-        "reduce_rollout": ".statistics.reduce",
-        "resolve_evaluators": ".metrics.score",
-        "rollout_values": ".statistics.reduce",
-        "score": ".metrics.score",
-        "series": ".metrics.score",
-    },
-)
+_HOMES = {
+    ".metrics": ("METRICS", "MetricInfo"),
+    ".metrics.collision": ("ContactEvent", "contact_events"),
+    ".metrics.presets": ("PRESETS", "Preset", "preset"),
+    ".metrics.score": ("resolve_evaluators", "score", "series"),
+    ".statistics.paired": ("paired",),
+    ".statistics.reduce": ("Reduction", "RolloutValue", "reduce_rollout", "rollout_values"),
+    ".statistics.summary": ("aggregate", "censoring"),
+}
+__getattr__ = lazy_names(__name__, {name: home for home, names in _HOMES.items() for name in names})

@@ -31,7 +31,7 @@ from alpasim_plugin.runtime.summary import pool_of
 from evaluators.statistics.baselines import StoredSide
 from evaluators.statistics.gate import failures_of
 from evaluators.statistics.sequential.control import Control, adjusted_draws
-from evaluators.statistics.sequential.decision import State, outcome_of, state_after
+from evaluators.statistics.sequential.decision import State, look_as_dict, outcome_of, state_after
 from evaluators.statistics.sequential.differences import SceneDifferences, next_seeds, scene_differences
 from evaluators.statistics.sequential.draws import Strata, families_of
 from evaluators.statistics.sequential.question import (
@@ -40,7 +40,6 @@ from evaluators.statistics.sequential.question import (
     Decision,
     Order,
     Question,
-    look_as_dict,
     question_as_dict,
     write_decision,
 )

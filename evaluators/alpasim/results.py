@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.types import F64, MetricInfo, MetricSeries
+from alpasim_plugin.core.types import MetricInfo, MetricSeries
 from evaluators.alpasim.settings import SceneScoreSettings
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.score import series
@@ -144,13 +144,9 @@ def _sweep(rows: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
     out: dict[str, float | None] = {name: float(np.mean(column)) if len(column) else None for name, column in columns.items()}
     out["n_clips"] = float(len(rows))
     for name, event in INCIDENTS.items():
-        out[name] = _km_between(columns["dist_traveled_m"], columns[event])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out[name] = float(np.sum(columns["dist_traveled_m"]) / np.sum(columns[event]) / 1000)
     return out
-
-
-def _km_between(driven_m: F64, events: F64) -> float:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.sum(driven_m) / np.sum(events) / 1000)
 
 
 FAULTS = ("collision_at_fault", "offroad")
@@ -264,7 +260,13 @@ def results_summary(
     entries = [
         _entry(one, scores.get(i), run_uuid, shown) for i, one in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
     ]
-    entries += [_failed_entry(one, settings.enabled, shown) for one in failed]
+    for failure in failed:
+        ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
+        error = failure.get("error")
+        entry = ids | {"status": "fail", "passed": False, "failure_reason": error, "metrics": ids | {"error": error}}
+        if settings.enabled:
+            entry |= {"score": 0.0, "score_metrics": {name: 0.0 if name == "progress_score" else None for name in shown}}
+        entries.append(entry)
     name = rollouts[0].of.run_name if rollouts else None
     saturation, least = settings.progress_saturation_threshold, settings.min_gt_distance_for_full_score_m
     overall: dict[str, Any] = {key: _number(value) for key, value in sweeps.items()}
@@ -299,15 +301,6 @@ def _entry(one: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: 
         "score_metrics": None if score is None else {name: (values | own).get(name) for name in shown},
         "metrics": values | ids,
     }
-
-
-def _failed_entry(failure: Mapping[str, Any], scored: bool, shown: Sequence[str]) -> dict[str, Any]:
-    ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
-    entry = ids | {"status": "fail", "passed": False, "failure_reason": failure.get("error")}
-    entry["metrics"] = ids | {"error": failure.get("error")}
-    if scored:
-        entry |= {"score": 0.0, "score_metrics": {name: 0.0 if name == "progress_score" else None for name in shown}}
-    return entry
 
 
 def _number(value: float | int | None) -> float | int | None:

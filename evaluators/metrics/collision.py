@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.contact import FRONT, LATERAL, REAR, SweptContacts, find_contacts, find_swept, last_per_step
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
@@ -71,29 +71,26 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     t_us = rollout.ego.t_us
     ego, actors = ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin)
     contacts, gap_m = find_contacts(ego, actors, t_us)
-    if preset.contact == "between_steps":
-        swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
-        gap_m[swept.step] = 0.0
-        return [*_flags(t_us, swept.step, swept.side, preset), _gap(t_us, gap_m, preset), *_first_contacts(rollout, swept)]
     if preset.hits == "last":
         contacts = last_per_step(contacts, ego, actors, t_us)
-    return [*_flags(t_us, contacts.step, contacts.side, preset), _gap(t_us, gap_m, preset)]
-
-
-def _flags(t_us: I64, step: I64, side: I64, preset: Preset) -> list[MetricSeries]:
-    front, rear, lateral = (_any_per_step(step[side == one], len(t_us)) for one in (FRONT, REAR, LATERAL))
+    step, side, first = contacts.step, contacts.side, []
+    if preset.contact == "between_steps":
+        swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
+        step, side, first = swept.step, swept.side, _first_contacts(rollout, swept)
+        gap_m[step] = 0.0
+    touched = np.zeros((3, len(t_us)), dtype=np.bool_)
+    touched[side, step] = True
+    front, rear, lateral = touched[FRONT], touched[REAR], touched[LATERAL]
+    there = np.isfinite(gap_m)
     return [
         series("collision_any", t_us, front | rear | lateral),
         *([] if preset.hits == "last" else [series("collision_at_fault", t_us, front | lateral)]),
         series("collision_front", t_us, front),
         series("collision_lateral", t_us, lateral),
         series("collision_rear", t_us, rear),
+        series("min_distance_to_obstacle_m", t_us, gap_m, there, "no other actor is present", keep_values=not preset.honour_valid),
+        *first,
     ]
-
-
-def _gap(t_us: I64, gap_m: F64, preset: Preset) -> MetricSeries:
-    there = np.isfinite(gap_m)
-    return series("min_distance_to_obstacle_m", t_us, gap_m, there, "no other actor is present", keep_values=not preset.honour_valid)
 
 
 def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSeries]:
@@ -117,12 +114,6 @@ def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSer
 def in_rig(xy: F64, rollout: RolloutLog) -> F64:
     """Return points ``(N, 2)`` of the ego's box frame in its rig frame."""
     return np.asarray(xy @ rollout.T_rig_box[:2, :2].T + rollout.T_rig_box[:2, 3])
-
-
-def _any_per_step(step: I64, n_steps: int) -> Bool:
-    out = np.zeros(n_steps, dtype=np.bool_)
-    out[step] = True
-    return out
 
 
 FACTORY = with_preset(evaluate_collision)

@@ -207,10 +207,11 @@ class ActorsAt:
 
     def centres(self) -> F64:
         """Return box centres ``(A, Q, 2)``; meaningless where not present."""
-        f = self.fraction[..., None]
         if not self.fraction.any():
             return np.asarray(self.table._xy[self.row])
-        return np.asarray(self.table._xy[self.row] * (1 - f) + self.table._xy[self._next()] * f)
+        f = self.fraction[..., None]
+        follows = np.where(self.fraction > 0, self.row + 1, self.row)
+        return np.asarray(self.table._xy[self.row] * (1 - f) + self.table._xy[follows] * f)
 
     def centre_distance_m(self, xy: F64) -> F64:
         """Return distances ``(A, Q)`` from points ``(Q, 2)`` to the centres; inf where an actor is absent."""
@@ -220,6 +221,3 @@ class ActorsAt:
     def footprints(self, actor: I64, query: I64) -> Footprints:
         """Return the boxes of pairs ``(M,)`` of actor and time."""
         return self.table.boxes_at(actor, self.row[actor, query], self.fraction[actor, query])
-
-    def _next(self) -> I64:
-        return np.asarray(np.where(self.fraction > 0, self.row + 1, self.row))

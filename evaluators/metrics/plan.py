@@ -235,10 +235,8 @@ def plan_gap(one: Trajectory, other: Trajectory, at_us: Sequence[int]) -> tuple[
     return gap, turn
 
 
-def first_divergence(
-    one: Sequence[LoggedPlan], other: Sequence[LoggedPlan], threshold_m: float = DIVERGED_M, horizon_us: int = HORIZON_US
-) -> Divergence | None:
-    """Return the first query common to both at which their plans lie more than a threshold apart at the horizon; None if there is none.
+def first_divergence(one: Sequence[LoggedPlan], other: Sequence[LoggedPlan]) -> Divergence | None:
+    """Return the first query common to both at which their plans lie more than `DIVERGED_M` apart at `HORIZON_US`; None if there is none.
 
     Plans that end before the horizon are compared at the end of the shorter one.
     """
@@ -247,8 +245,8 @@ def first_divergence(
         if plan.now_us not in plans or not len(plan.trajectory):
             continue
         mine, theirs = plan.trajectory, plans[plan.now_us]
-        at_us = min(plan.now_us + horizon_us, int(mine.t_us[-1]), int(theirs.t_us[-1]))
+        at_us = min(plan.now_us + HORIZON_US, int(mine.t_us[-1]), int(theirs.t_us[-1]))
         gap = float(plan_gap(mine, theirs, [at_us])[0][0])
-        if gap > threshold_m:
+        if gap > DIVERGED_M:
             return Divergence(plan.now_us, gap, at_us - plan.now_us)
     return None

@@ -159,7 +159,9 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     aside_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
     so_far = progress_so_far(there, ego)
-    traveled_m = driven(ego, int(np.argmax(engaged)) if preset.distance_from == "handover" else 0)
+    driven_m = arc_lengths(ego)
+    first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
+    traveled_m = np.maximum(driven_m - driven_m[first], 0.0)
     if preset.invented_starts:
         # AlpaSim fills the first two rows in by hand, and projects the ego on its own path instead of adding up its steps.
         traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
@@ -198,12 +200,6 @@ def lateral_bias(rollout: RolloutLog) -> MetricSeries:
     """Return ``lateral_bias_m`` of a rollout, for tables of presets whose metrics do not have it, such as ``alpasim``."""
     # The map plays no part in it.
     return next(one for one in evaluate_route(rollout, None, PRESETS["paper"]) if one.name == "lateral_bias_m")
-
-
-def driven(ego: F64, first: int) -> F64:
-    """Return metres driven ``(T,)`` along positions ``(T, 2)`` since step ``first``, 0 before it."""
-    s = arc_lengths(ego)
-    return np.asarray(np.maximum(s - s[first], 0.0))
 
 
 FACTORY = with_preset(evaluate_route)

@@ -205,8 +205,4 @@ def _check_size(who: str, length_m: float, width_m: float, rollout: RolloutLog) 
 
 def with_preset(function: Callable[..., list[MetricSeries]]) -> Callable[[Preset], Any]:
     """Return the factory of an evaluator that is a function ``(rollout, scene, preset) -> series``."""
-
-    def factory(preset: Preset) -> Any:
-        return partial(function, preset=preset)
-
-    return factory
+    return lambda preset: partial(function, preset=preset)

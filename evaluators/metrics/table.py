@@ -102,13 +102,24 @@ class MetricTable(Mapping[str, MetricInfo]):
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
         """Return METRIC -> the facts that are not their defaults, for ``run.json``."""
-        return {name: {key: value for key, value in asdict(facts).items() if _is_said(key, value)} for name, facts in self.items()}
+        plain = asdict(UNKNOWN)
+        always = ("unit", "direction", "aggregation", "help")
+        out = {}
+        for name, facts in self.items():
+            said = {key: value for key, value in asdict(facts).items() if key in always or value != plain[key]}
+            out[name] = {key: value for key, value in said.items() if key != "name"}
+        return out
 
     @classmethod
     def of_run(cls, info: Mapping[str, Any]) -> MetricTable:
         """Return the table that a run's ``run.json`` carries; ours for what it lacks, so that a run can be read without its plug-ins."""
-        stored = info.get("metrics") or {}
-        return cls(METRICS._metrics | {name: _metric(facts) for name, facts in stored.items()})
+        stored = {}
+        for name, facts in (info.get("metrics") or {}).items():
+            known = {key: value for key, value in facts.items() if key in _FIELDS}  # this version may not know all
+            if "limits" in known:
+                known["limits"] = tuple(known["limits"])
+            stored[name] = MetricInfo(**known)
+        return cls(METRICS._metrics | stored)
 
     def joined(self, other: MetricTable, names: Iterable[str], doing: str, who: str) -> MetricTable:
         """Return the table of two runs that are set side by side: this one's metrics, and what only the other has.
@@ -140,16 +151,6 @@ def table_of(evaluators: Iterable[PartSpec]) -> MetricTable:
     for spec in evaluators:
         table = table.adding(spec.metrics)
     return table
-
-
-def _is_said(key: str, value: Any) -> bool:
-    return key in ("unit", "direction", "aggregation", "help") or (key != "name" and value != getattr(UNKNOWN, key))
-
-
-def _metric(facts: Mapping[str, Any]) -> MetricInfo:
-    """Return a metric as ``run.json`` holds it; facts that this version does not know are left out."""
-    known = {key: tuple(value) if key == "limits" else value for key, value in facts.items() if key in _FIELDS}
-    return MetricInfo(**known)
 
 
 def _flag(help_text: str, direction: Direction = "lower", aggregation: Aggregation = "max", **more: Any) -> MetricInfo:

@@ -337,7 +337,12 @@ def _name(axes: Axes, points: Sequence[_Point]) -> None:
         steps = sorted((5.0 + LINE_PT * k for k in range(-12, 13)), key=lambda dy: abs(dy - 5.0))
         boxes = ((x + dx, x + dx + width, y + dy, y + dy + LINE_PT) for dy in steps)
         bottom, top = axes.bbox.y0 / point_px, axes.bbox.y1 / point_px
-        box = next((b for b in boxes if b[2] >= bottom and b[3] <= top and not any(_overlap(b, t) for t in taken)), None)
+        box = None
+        for b in boxes:
+            covers = any(b[0] < t[1] and t[0] < b[1] and b[2] < t[3] and t[2] < b[3] for t in taken)
+            if b[2] >= bottom and b[3] <= top and not covers:
+                box = b
+                break
         box = box or (x + dx, x + dx + width, y + 5.0, y + 5.0 + LINE_PT)
         taken.append(box)
         colour = VARIANT[point.line.variant % N_COLOURS]
@@ -351,10 +356,6 @@ def _no_magnifying(get: Callable[[], tuple[float, float]], put: Callable[[float,
     lacking = LEAST_SPAN.get(unit, 0.0) - (high - low)
     if lacking > 0.0:
         put(low - lacking / 2, high + lacking / 2)
-
-
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[1] and b[0] < a[1] and a[2] < b[3] and b[2] < a[3]
 
 
 def _time_axis(axes: Axes, ms: Sequence[float]) -> None:

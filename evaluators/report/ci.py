@@ -74,12 +74,19 @@ def summary_md(run: Run) -> str:
     removed = ledger(run, LEDGER_RATES)
     if removed:
         head = ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES]
-        body = [[r.renderer, *(_tally(c) for c in r.counts), *(c.text for c in r.bounds)] for r in removed]
+        body = []
+        for r in removed:
+            counts = [f"{c.text} ({c.note})" if c.note and c.text != "0" else c.text for c in r.counts]
+            body.append([r.renderer, *counts, *(c.text for c in r.bounds)])
         parts.append(f"\n### Not in the numbers\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
     failures, more = failure_rows(run)
     if failures:
         head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
-        body = [[*_key(f.rollout), "; ".join(f"{label}: {text}" for label, text in f.parts)] for f in failures]
+        body = []
+        for failure in failures:
+            r = failure.rollout
+            what = "; ".join(f"{label}: {text}" for label, text in failure.parts)
+            body.append([r.failure_class, r.renderer, r.policy, r.scene, str(r.seed), what])
         parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
     command = provenance(run).command
     parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")
@@ -99,14 +106,6 @@ def cut(text: str, limit: int = MAX_BYTES) -> str:
         return text
     kept = data[: limit - len(CUT_NOTE.encode())]
     return kept[: kept.rfind(b"\n") + 1].decode() + CUT_NOTE
-
-
-def _tally(cell: Cell) -> str:
-    return f"{cell.text} ({cell.note})" if cell.note and cell.text != "0" else cell.text
-
-
-def _key(rollout: Rollout) -> list[str]:
-    return [rollout.failure_class, rollout.renderer, rollout.policy, rollout.scene, str(rollout.seed)]
 
 
 def metric_label(name: str, unit: str, arrow: str) -> str:

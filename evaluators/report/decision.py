@@ -12,7 +12,7 @@ from alpasim_plugin.run_folder.sides import Row
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.opening import Run
 from evaluators.report.numbers import decimals, fixed
-from evaluators.report.terminal import LABEL
+from evaluators.report.terminal import LABEL, labelled
 from evaluators.statistics.gate import Check, GateSpec, GateVerdict, judge
 from evaluators.statistics.sequential.question import Decision, read_decision
 from evaluators.statistics.verdicts import WORDS, Cause, Outcome, outcome_of_failures, worst
@@ -44,17 +44,17 @@ def verdict_line(decision: Decision) -> str:
     verdict = decision["verdict"] if cause in ("pass", "regression", "undecided") else WORDS[cause].lower()
     text = f"{decision['candidate']} against {decision['baseline']}: {verdict}, {after}"
     why = "" if decision["stopped"] == "decided" else f" ({decision['stopped']})"
-    return _line("verdict", text + why)
+    return labelled("verdict", text + why)
 
 
-def metric_lines(decision: Decision, known: MetricTable = METRICS) -> list[str]:
+def metric_lines(decision: Decision) -> list[str]:
     """Return one line a metric, and one for the guarantee."""
     lines = []
-    for row in metric_rows(decision, known):
+    for row in metric_rows(decision):
         note = "" if row.binding else ", not binding"
         text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
-        lines.append(_line("", text))
-    return [*lines, *(_line("sure" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
+        lines.append(labelled("", text))
+    return [*lines, *(labelled("sure" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
 
 
 def guarantee(decision: Decision) -> list[str]:
@@ -136,7 +136,8 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     looks = decision["looks"]
     scale, unit, _ = _print_as(metric, [])
     n = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
-    diff, low, high = (scale * _series([_at(look["metrics"][name], k) for look in looks]) for k in range(3))
+    seen = [look["metrics"][name] for look in looks]
+    diff, low, high = scale * np.array([[one["diff"], *one["interval"]] for one in seen], dtype=np.float64).T  # None becomes NaN
     sign = -1.0 if metric.direction == "higher" else 1.0
     threshold = scale * sign * one["threshold"]
     limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
@@ -147,7 +148,9 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
         for limit in limits:
             axes.axhline(limit, color=INK, linewidth=1.0, linestyle=(0, (5.0, 2.0)))
-        known = np.concatenate([diff[np.isfinite(diff)], limits, [0.0], *_late(low, high)])
+        late = len(looks) // 2  # the bounds of the first looks would make the rest flat
+        known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
+        known = known[np.isfinite(known)]
         room = 0.15 * max(float(np.ptp(known)), 1e-9)
         axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
         axes.set_xlim(0.0, float(n[-1]) * 1.02)
@@ -158,31 +161,12 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     return Chart(name, "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.", svg)
 
 
-def _late(low: Any, high: Any) -> list[Any]:
-    """Return the bounds of the later half of the looks: the first ones would make the rest flat."""
-    half = len(low) // 2
-    return [ends[half:][np.isfinite(ends[half:])] for ends in (low, high)]
-
-
-def _at(look: Any, k: int) -> float | None:
-    value: float | None = look["diff"] if k == 0 else look["interval"][k - 1]
-    return value
-
-
-def _series(values: Sequence[float | None]) -> Any:
-    return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-
-
 def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float, str, int]:
     """Return scale, unit and decimals in which a metric's differences are printed."""
     unit = metric.unit
     if metric.in_percent:
         return 100.0, " points", decimals(*(None if v is None else 100.0 * v for v in values))
     return 1.0, f" {unit}" if unit else "", decimals(*values)
-
-
-def _line(label: str, text: str) -> str:
-    return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")
 
 
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}

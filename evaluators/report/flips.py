@@ -112,14 +112,9 @@ def _comparison(run: Run, scene: str, policy: str, seed: int, members: list[Roll
     if not strips:
         return None
     differing = len(set(times)) > 1
-    zero = _start_us(run, scene)
+    zero = int((run.scene_data(scene) or {}).get("start_us") or 0)
     printed = () if differing else tuple(f"t = {fixed((t - zero) * 1e-6, 1)}\u00a0s" for t in times[0])
     return Comparison(scene, policy, seed, printed, tuple(strips), tuple(absent), differing)
-
-
-def _start_us(run: Run, scene: str) -> int:
-    content = run.scene_data(scene) or {}
-    return int(content.get("start_us") or 0)
 
 
 def inline_jpeg(path: Path) -> tuple[str, int, int] | None:

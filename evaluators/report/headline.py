@@ -118,10 +118,6 @@ def _listing(run: Run, metrics: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
-def _baseline(pairs: Mapping[str, Any]) -> str:
-    return str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
-
-
 def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     stats = run.summary.get("metrics", {}).get(variant, {})
     lead = [m for m in run.table.headline if m in pairs and finite(pairs[m].get("diff")) is not None]
@@ -146,7 +142,7 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
         text or "no metric is valid in both members of any pair",
         worse,
         better,
-        _baseline(pairs),
+        str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline")),
         _lead(run, variant, pairs, lead),
     )
 

@@ -204,10 +204,23 @@ def ledger(run: Run, rates: tuple[str, ...]) -> list[LedgerRow]:
     for renderer, entry in (run.summary.get("censoring") or {}).items():
         if not isinstance(entry, Mapping) or "rollouts" not in entry:
             continue
-        bounds = entry.get("bounds") or {}
-        rows.append(
-            LedgerRow(renderer, tuple(_tally(entry.get(key)) for key, _, _ in LEDGER_COLUMNS), tuple(_bound(bounds.get(r)) for r in rates))
-        )
+        counts, bounds = [], []
+        for key, _, _ in LEDGER_COLUMNS:
+            found = entry.get(key)
+            number = finite(found)
+            if isinstance(found, Mapping):
+                total = sum(int(n) for n in found.values())
+                counts.append(Cell(str(total), "", ", ".join(f"{cause} {n}" for cause, n in found.items()), sort=total))
+            else:
+                counts.append(missing("not counted") if number is None else Cell(fixed(number, 0), sort=number))
+        for rate in rates:
+            ends = interval((entry.get("bounds") or {}).get(rate))
+            if ends is None:
+                bounds.append(missing("not a rate of this run"))
+                continue
+            low, high = (fixed(100 * v, 1) for v in ends)
+            bounds.append(Cell(f"{low}\u00a0%" if low == high else f"{low} to {high}\u00a0%", sort=ends[1]))
+        rows.append(LedgerRow(renderer, tuple(counts), tuple(bounds)))
     return rows
 
 
@@ -229,19 +242,3 @@ def invalid_rows(run: Run) -> list[InvalidRow]:
             reasons = "; ".join(f"{reason} ({n})" for reason, n in (found.get("reasons") or {}).items())
             rows.append(InvalidRow(renderer, metric, int(found.get("rollouts") or 0), reasons or "not given"))
     return rows
-
-
-def _tally(value: Any) -> Cell:
-    if isinstance(value, Mapping):
-        total = sum(int(n) for n in value.values())
-        return Cell(str(total), "", ", ".join(f"{cause} {n}" for cause, n in value.items()), sort=total)
-    number = finite(value)
-    return missing("not counted") if number is None else Cell(fixed(number, 0), sort=number)
-
-
-def _bound(value: Any) -> Cell:
-    bounds = interval(value)
-    if bounds is None:
-        return missing("not a rate of this run")
-    low, high = (fixed(100 * v, 1) for v in bounds)
-    return Cell(f"{low}\u00a0%" if low == high else f"{low} to {high}\u00a0%", sort=bounds[1])

@@ -154,7 +154,8 @@ def rollout_block(run: Run) -> RolloutBlock:
 
     def add(name: str, kind: str, data: npt.NDArray[Any], **more: Any) -> None:
         header.append({"name": name, "type": kind} | more)
-        columns.append(_by_significance(data))
+        by_significance = data.view(np.uint8).reshape(len(data), data.itemsize).T
+        columns.append(np.ascontiguousarray(by_significance).reshape(-1))
 
     texts: dict[str, Iterable[str]] = {
         "scene": (r.scene for r in rollouts),
@@ -192,11 +193,6 @@ def _rounded(values: Sequence[float | None]) -> npt.NDArray[np.float32]:
     exact = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
     mantissa, exponent = np.frexp(exact)
     return np.asarray(np.ldexp(np.round(np.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS), dtype="<f4")
-
-
-def _by_significance(values: npt.NDArray[Any]) -> Bytes:
-    """Return the bytes of numbers ``(N,)``, all lowest ones first."""
-    return np.ascontiguousarray(values.view(np.uint8).reshape(len(values), values.itemsize).T).reshape(-1)
 
 
 def _states(run: Run, parents: Sequence[tuple[str, str]]) -> Bytes:

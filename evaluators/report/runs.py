@@ -211,7 +211,13 @@ def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntr
         for folder in _run_folders(root, set()):
             state = folder.stat()
             found.setdefault((state.st_dev, state.st_ino), folder)
-    return sorted((read_entry(folder, with_summary) for folder in found.values()), key=_newest_first)
+
+    def newest_first(entry: RunEntry) -> tuple[float, str]:
+        """Sort by start; a folder that does not say when it was begun comes last."""
+        began = entry.started_at
+        return (-began.timestamp() if began is not None else float("inf"), str(entry.folder))
+
+    return sorted((read_entry(folder, with_summary) for folder in found.values()), key=newest_first)
 
 
 def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
@@ -232,12 +238,6 @@ def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
     for entry in entries:
         if not entry.name.startswith(".") and entry.name not in SKIPPED and entry.is_dir():
             yield from _run_folders(Path(entry.path), seen)
-
-
-def _newest_first(entry: RunEntry) -> tuple[float, str]:
-    """Sort by start; a folder that does not say when it was begun comes last."""
-    began = entry.started_at
-    return (-began.timestamp() if began is not None else float("inf"), str(entry.folder))
 
 
 LEAST_DIGITS = 4  # of a commit or a digest: fewer name anything

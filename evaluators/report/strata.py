@@ -113,7 +113,11 @@ def stratum_rows(one: Strata) -> list[StratumRow]:
     rows = []
     for order, stratum in enumerate(one.strata):
         for b in stratum.bins:
-            counts = [Cell(str(b.events[name]), _rate(b.events[name], b.seconds), sort=b.events[name]) for name, _ in EVENTS]
+            counts = []
+            for name, _ in EVENTS:
+                n = b.events[name]
+                rate = f"{short(100 * n / b.seconds)} per 100 s driven" if b.seconds > 0 else ""
+                counts.append(Cell(str(n), rate, sort=n))
             values = [_mean(b, name) for name in VALUES]
             time = Cell(f"{fixed(b.seconds, 1)}\u00a0s", plural(b.rollouts, "rollout"), sort=b.seconds)
             rows.append(StratumRow(stratum.label, order, b.renderer, b.variant, (time, *counts, *values)))
@@ -213,10 +217,6 @@ def _mean(b: Bin, name: str) -> Cell:
     return Cell(short(mean), "" if detail else f"no interval: it needs {LEAST_SCENES} scenes", detail, sort=mean)
 
 
-def _rate(n: int, seconds: float) -> str:
-    return f"{short(100 * n / seconds)} per 100 s driven" if seconds > 0 else ""
-
-
 def _labels(edges: Sequence[float], unit: str) -> list[str]:
     tail = f"\u00a0{unit}" if unit else ""
     if not edges:
@@ -247,7 +247,9 @@ def strata_chart(one: Strata) -> Chart | None:
                 axes.plot([x], [mean], MARKERS[b.variant % len(MARKERS)], color=colour, markersize=6)
         for k in range(1, len(known)):
             axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
-        axes.set_xticks(range(len(known)), [_tick(s.label, one.unit) for s in known], fontsize=8.5)
+        ticks = [s.label.replace(f"\u00a0{one.unit}", "") if one.unit else s.label for s in known]
+        ticks = [tick.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013") for tick in ticks]
+        axes.set_xticks(range(len(known)), ticks, fontsize=8.5)
         axes.set_xlim(-0.5, len(known) - 0.5)
         axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])  # the highest marker is whole
         axes.set_ylabel("m between plans in a row")
@@ -255,8 +257,3 @@ def strata_chart(one: Strata) -> Chart | None:
         axes.tick_params(length=0)
         svg = themed_svg(figure)
     return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", svg)
-
-
-def _tick(label: str, unit: str) -> str:
-    short_label = label.replace("\u00a0" + unit, "") if unit else label
-    return short_label.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013")

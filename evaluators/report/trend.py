@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime
 from itertools import pairwise
 from typing import Any
 
@@ -65,7 +64,7 @@ def changes(before: RunEntry, after: RunEntry, renderer: str, policy: str) -> tu
         *_differences("code of the", *(one.info.get("code") or {} for one in sides)),
         *_differences("", *(_scenes(one, renderer) for one in sides)),
         *_differences("", *(_options(one) for one in sides)),
-        *_differences("", *(_project(one) for one in sides)),
+        *_differences("", *({"commit": one.commit_text or None, "simrun": one.info.get("version")} for one in sides)),
         *_differences("version of", *(one.info.get("versions") or {} for one in sides)),
         *_differences("machine:", *(one.info.get("hardware") or {} for one in sides)),
     ]
@@ -146,10 +145,6 @@ def _scenes(entry: RunEntry, renderer: str) -> dict[str, Any]:
 def _options(entry: RunEntry) -> dict[str, Any]:
     config = entry.info.get("config") or {}
     return {f"--{name}": value for name, value in config.items() if name not in NO_EFFECT} if entry.kind == "run" else dict(config)
-
-
-def _project(entry: RunEntry) -> dict[str, Any]:
-    return {"commit": entry.commit_text or None, "simrun": entry.info.get("version")}
 
 
 DOING = "comparing many runs"
@@ -266,8 +261,14 @@ def trend(entries: Sequence[RunEntry], metrics: Sequence[str]) -> Trend:
     left_out += [(one, "no other run has its scenes, seeds, policy and preset") for one in usable if id(one) not in joined]
     by_commit = bool(joined) and all(as_time(one.project.get("committed_at")) is not None for one in joined.values())
     tables = _Tables(metrics)
-    ordered = ((setting, sorted(runs, key=lambda one: _order(one, by_commit))) for setting, runs in groups.items() if len(runs) > 1)
-    series = [_series(setting, runs, metrics, tables) for setting, runs in ordered]
+
+    def order(entry: RunEntry) -> tuple[float, float, str]:
+        """Sort by commit where all runs have the time of theirs, then by start."""
+        times = as_time(entry.project.get("committed_at")) if by_commit else None, entry.started_at
+        committed, began = (0.0 if time is None else time.timestamp() for time in times)
+        return committed, began, str(entry.folder)
+
+    series = [_series(setting, sorted(runs, key=order), metrics, tables) for setting, runs in groups.items() if len(runs) > 1]
     return Trend(tuple(sorted(series, key=lambda one: -len(one.runs))), tuple(left_out), by_commit)
 
 
@@ -284,16 +285,6 @@ def _usable(entries: Sequence[RunEntry]) -> tuple[list[RunEntry], list[tuple[Run
         else:
             usable.append(entry)
     return usable, left_out
-
-
-def _order(entry: RunEntry, by_commit: bool) -> tuple[float, float, str]:
-    """Sort by commit where all runs have the time of theirs, then by start."""
-    began, committed = entry.started_at, as_time(entry.project.get("committed_at")) if by_commit else None
-    return _seconds(committed), _seconds(began), str(entry.folder)
-
-
-def _seconds(time: datetime | None) -> float:
-    return time.timestamp() if time is not None else 0.0
 
 
 def _settings(entry: RunEntry) -> list[Setting]:

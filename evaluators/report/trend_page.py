@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +10,11 @@ from urllib.parse import quote
 
 import matplotlib as mpl
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from alpasim_plugin.io.atomic import write_text
 from evaluators.report.charts import MARKERS, MUTED, N_COLOURS, RC, VARIANT, Chart, new_axes, themed_svg
-from evaluators.report.html import asset
-from evaluators.report.numbers import finite, interval, plural
+from evaluators.report.html import render_page
+from evaluators.report.numbers import finite, interval
 from evaluators.report.runs import RunEntry, shown_folder
 from evaluators.report.tables import PairRow
 from evaluators.report.trend import Line, Series, Step, Trend
@@ -76,19 +72,20 @@ def write_trend(found: Trend, roots: Sequence[Path], path: Path) -> None:
 
 def render_trend(found: Trend, roots: Sequence[Path], beside: Path) -> str:
     """Return the page; links to the runs' reports are relative to the folder ``beside``."""
-    environment = Environment(
-        loader=PackageLoader("evaluators.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    style = "\n".join(asset(environment, name) for name in ("theme.css", "report.css", "trend.css"))
-    script = "\n".join(asset(environment, name) for name in ("theme.js", "report.js"))
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     names = dict.fromkeys(line.renderer for series in found.series for line in series.lines)
     colours = {name: k for k, name in enumerate(names)}
-    sections = [_section(series, colours) for series in found.series]
+    sections = []
+    for series in found.series:
+        parts = []
+        for metric in dict.fromkeys(line.metric for line in series.lines):
+            lines = tuple((line, whole_text(line), tuple(step_rows(series, line))) for line in series.lines if line.metric == metric)
+            meaning = series.runs[-1].table.shown(metric).help
+            parts.append(MetricPart(metric, meaning, trend_chart(series, metric, colours), lines))
+        sections.append(Section(setting_text(series), series, tuple(parts)))
     steps = [step for series in found.series for line in series.lines for step in line.steps]
     moved = _moved(found, colours)
-    return environment.get_template("trend.html.j2").render(
-        style=Markup(style), script=Markup(script), script_hash=digest, plural=plural, sections=sections, colours=colours,
+    return render_page(
+        "trend.html.j2", ("theme", "report", "trend"), ("theme", "report"), sections=sections, colours=colours,
         moved=moved[:MOST_MOVED], more_moved=max(0, len(moved) - MOST_MOVED), n_steps=len(steps), false_alarms=0.05 * len(steps),
         n_runs=len({id(run) for series in found.series for run in series.runs}), by_commit=found.by_commit,
         open_rows=OPEN_ROWS, most_rows=MOST_ROWS,
@@ -101,15 +98,6 @@ def report_href(run: RunEntry, beside: Path) -> str | None:
     """Return the address of a run's report relative to a folder; None where it has none."""
     report = run.folder / "report.html"
     return quote(os.path.relpath(report.resolve(), beside.resolve())) if report.is_file() else None
-
-
-def _section(series: Series, colours: dict[str, int]) -> Section:
-    parts = []
-    known = series.runs[-1].table
-    for metric in dict.fromkeys(line.metric for line in series.lines):
-        lines = tuple((line, whole_text(line), tuple(step_rows(series, line))) for line in series.lines if line.metric == metric)
-        parts.append(MetricPart(metric, known.shown(metric).help, trend_chart(series, metric, colours), lines))
-    return Section(setting_text(series), series, tuple(parts))
 
 
 def _moved(found: Trend, colours: dict[str, int]) -> list[MovedRow]:
@@ -172,7 +160,8 @@ def trend_chart(series: Series, metric: str, colours: Mapping[str, int]) -> Char
         axes.tick_params(length=0)
         axes.margins(y=0.12)
         svg = themed_svg(figure)
-    better = {"lower": "Lower is better. ", "higher": "Higher is better. "}.get(_direction(facts), "")
+    direction = next((str(one["direction"]) for one in facts if one.get("direction")), "none")
+    better = {"lower": "Lower is better. ", "higher": "Higher is better. "}.get(direction, "")
     note = f"{better}{'Bands' if is_dense else 'Bars'}: 95 % over scenes. A ring: moved against the run before it, on the same cells."
     return Chart(metric, note, svg)
 
@@ -190,7 +179,3 @@ def _values(series: Series, line: Line, scale: float) -> tuple[list[float], list
     bounds = [interval(one.get("ci95_clustered")) for one in found]
     scaled = [None if one is None else (one[0] * scale, one[1] * scale) for one in bounds]
     return [float("nan") if one is None else one * scale for one in means], scaled
-
-
-def _direction(facts: Sequence[Mapping[str, object]]) -> str:
-    return next((str(one["direction"]) for one in facts if one.get("direction")), "none")

@@ -61,11 +61,8 @@ def runs_table(entries: Sequence[RunEntry], roots: Sequence[Path], metrics: Sequ
         values = (Text("\n".join(value_text(entry, metric, *one) for one in variants_of(entry)) or DASH) for metric in metrics)
         shown = (cells[k] for name, cells in texts.items() if name not in left_out)
         table.add_row(Text(escape(shown_folder(entry.folder, roots)), style="bold"), *shown, *values)
-    return table, "; ".join(f"{name} {_on_one_line(cell)}" for name, cell in same.items())
-
-
-def _on_one_line(cell: Text) -> str:
-    return ", ".join(dict.fromkeys(cell.plain.splitlines()))
+    shared = {name: ", ".join(dict.fromkeys(cell.plain.splitlines())) for name, cell in same.items()}
+    return table, "; ".join(f"{name} {text}" for name, text in shared.items())
 
 
 def variants_of(entry: RunEntry) -> list[tuple[str, str]]:
@@ -136,9 +133,11 @@ class StepRow:
 
 def step_rows(series: Series, line: Line) -> list[StepRow]:
     """Return the runs of a line, the newest first."""
-    first = StepRow(line.runs[0], _value(series, line, line.runs[0]), None, "", False)
-    later = [StepRow(s.after, _value(series, line, s.after), pair_row(line, s), changed_text(s), s.moved) for s in line.steps]
-    return [*reversed(later), first]
+    values = [value_text(run, line.metric, line.renderer, series.setting.policy) for run in line.runs]
+    rows = [StepRow(line.runs[0], values[0], None, "", False)]
+    for step, value in zip(line.steps, values[1:], strict=True):
+        rows.append(StepRow(step.after, value, pair_row(line, step), changed_text(step), step.moved))
+    return rows[::-1]
 
 
 def pair_row(line: Line, step: Step) -> PairRow:
@@ -210,28 +209,19 @@ def as_json(found: Trend) -> dict[str, Any]:
 def _series_json(series: Series) -> dict[str, Any]:
     setting = series.setting
     shared = {"kind": setting.kind, "policy": setting.policy, "preset": setting.preset, "seeds": list(setting.seeds)}
-    lines = [
-        {
-            "metric": line.metric,
-            "renderer": line.renderer,
-            "runs": [{"folder": str(run.folder), "commit": run.commit or None, **_mean(series, line, run)} for run in line.runs],
-            "steps": [_step_json(step) for step in line.steps],
-            "whole": _step_json(line.whole),
-        }
-        for line in series.lines
-    ]
+    lines = []
+    for line in series.lines:
+        runs = []
+        for run in line.runs:
+            found = run.metric(line.metric, line.renderer, setting.policy)
+            mean = {key: found.get(key) for key in ("mean", "ci95_clustered")}
+            runs.append({"folder": str(run.folder), "commit": run.commit or None, **mean})
+        steps = [_step_json(step) for step in line.steps]
+        whole = _step_json(line.whole)
+        lines.append({"metric": line.metric, "renderer": line.renderer, "runs": runs, "steps": steps, "whole": whole})
     return {**shared, "scenes": dict(sorted(setting.scenes)), "lines": lines}
-
-
-def _mean(series: Series, line: Line, run: RunEntry) -> dict[str, Any]:
-    found = run.metric(line.metric, line.renderer, series.setting.policy)
-    return {key: found.get(key) for key in ("mean", "ci95_clustered")}
 
 
 def _step_json(step: Step) -> dict[str, Any]:
     kept = {key: step.entry[key] for key in KEPT if key in step.entry}
     return {"before": str(step.before.folder), "after": str(step.after.folder), **kept, "changes": [one.as_dict() for one in step.changes]}
-
-
-def _value(series: Series, line: Line, run: RunEntry) -> str:
-    return value_text(run, line.metric, line.renderer, series.setting.policy)

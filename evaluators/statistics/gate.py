@@ -73,7 +73,10 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
     Raises:
         InputError: No such file, bad YAML, an unknown key, metric or preset: with file, line and column.
     """
-    path = _locate(str(path_or_name))
+    shipped = LIBRARY / f"{path_or_name}.yaml"
+    path = next((one for one in (Path(path_or_name), shipped) if one.is_file()), None)
+    if path is None:
+        raise InputError(DOING, str(path_or_name), "no such file", f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}")
     document = load_yaml(path, DOING)
     spec = validate(GateSpec, document, DOING)
     _check_names(spec, document, known)
@@ -83,16 +86,6 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
 def shipped_gates() -> list[str]:
     """Return the names of the gates that come with the package."""
     return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
-
-
-def _locate(text: str) -> Path:
-    path = Path(text)
-    if path.is_file():
-        return path
-    shipped = LIBRARY / f"{text}.yaml"
-    if shipped.is_file():
-        return shipped
-    raise InputError(DOING, text, "no such file", f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}")
 
 
 def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None:
@@ -231,12 +224,12 @@ def _judged(here: Sides, spec: GateSpec, has_stored: bool) -> list[str]:
         return list(here)
     base = spec.baseline or next(iter(here))
     judged = [name for name in here if name != base]
-    # A gate of limits alone needs no second renderer.
-    return judged or ([base] if all(rule.margin is None for rule in spec.metrics.values()) else _nothing(base))
-
-
-def _nothing(base: str) -> list[str]:
-    raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", "run two renderers, or give --baseline-file")
+    if judged:
+        return judged
+    if any(rule.margin is not None for rule in spec.metrics.values()):  # a gate of limits alone needs no second renderer
+        do = "run two renderers, or give --baseline-file"
+        raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", do)
+    return [base]
 
 
 def _baseline_name(renderer: str, here: Sides, there: Sides, spec: GateSpec, has_stored: bool) -> str:

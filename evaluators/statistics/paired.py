@@ -76,28 +76,26 @@ def paired_sides(
     }
 
 
-def base_pairs(rows: Sequence[Row], baseline: str | None, bases: Mapping[str, str]) -> dict[str, dict[str, dict[str, Any]]]:
+def base_pairs(
+    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str], known: MetricTable = METRICS
+) -> dict[str, dict[str, dict[str, Any]]]:
     """Compare every renderer with a fixer with the renderer below it: what the fixer itself does.
 
     Args:
-        rows: As for `aggregate`, of one policy.
+        sides: RENDERER -> its rollouts, of one policy.
+        metrics: Which metrics.
         baseline: What the others are compared with already; a fixer over it is left out here.
-        bases: Renderer with a fixer -> the renderer below it.
+        bases: Renderer with a fixer -> the renderer below it; pairs of which one was not driven are left out.
+        known: What the metrics are.
 
     Returns:
-        RENDERER -> METRIC -> what `compare` gives; without those whose base was not driven.
+        RENDERER -> METRIC -> what `compare` gives.
     """
-    return base_pairs_of_sides(by_renderer(rows), metric_names(rows), baseline, bases)
-
-
-def base_pairs_of_sides(
-    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str], known: MetricTable = METRICS
-) -> dict[str, dict[str, dict[str, Any]]]:
-    """Compare every renderer with a fixer with the renderer below it; see `base_pairs`."""
-    chosen = {name: base for name, base in bases.items() if name in sides and base in sides and base != baseline and name != baseline}
-    return {
-        name: {metric: compare(sides[name], sides[base], known.info(metric), base) for metric in metrics} for name, base in chosen.items()
-    }
+    out = {}
+    for name, base in bases.items():
+        if {name, base} <= sides.keys() and baseline not in (name, base):
+            out[name] = {metric: compare(sides[name], sides[base], known.info(metric), base) for metric in metrics}
+    return out
 
 
 def compare(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.types import F64, I64, Aggregation, Bool, Direction, MetricInfo, MetricSeries
+from alpasim_plugin.core.types import F64, I64, Aggregation, Direction, MetricInfo, MetricSeries
 from evaluators.metrics import METRICS
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
@@ -111,7 +111,10 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = "paper
         values["duration_frac_20s"] = _value(METRICS["duration_frac_20s"], float(scored[-1] - scored[0]) / 20e6)
     if "progress_rel_to_total" in values:
         values["progress_clipped_rel"] = values["progress_rel_to_total"]
-    return Reduction(values, ledger, () if ledger.dropped else _events(table, first_us, last_us))
+    found = [] if ledger.dropped else [(_first_time(table[name], first_us), name) for name in EVENTS if name in table]
+    times = [(t, name) for t, name in found if t is not None and t <= last_us]
+    events = ({"metric": name, "t_us": t} for t, name in sorted(times, key=lambda event: event[0]))
+    return Reduction(values, ledger, tuple(events))
 
 
 _DERIVED_FLAGS = {
@@ -142,7 +145,7 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
     else:
         return 0, -1, Ledger(n, n, 0, 0, 0, NEVER_ENGAGED)
     first_us = int(line[first])
-    if preset.drop_black and "img_is_black" in table and bool(np.any(_fired(table["img_is_black"], first_us))):
+    if preset.drop_black and "img_is_black" in table and _first_time(table["img_is_black"], first_us) is not None:
         return 0, -1, Ledger(n, first, 0, 0, 0, BLACK)
     stops = [_first_time(table[name], first_us) for name in preset.stop_after if name in table]
     event_us = min((t for t in stops if t is not None), default=int(line[-1]))
@@ -157,18 +160,9 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
     return first_us, last_us, Ledger(n, first, after_event, n - first - after_event - scored, scored, "")
 
 
-def _fired(one: MetricSeries, first_us: int) -> Bool:
-    return np.asarray(one.valid & (one.value > 0) & (one.t_us >= first_us))
-
-
 def _first_time(one: MetricSeries, first_us: int) -> int | None:
-    fired = _fired(one, first_us)
+    fired = one.valid & (one.value > 0) & (one.t_us >= first_us)
     return int(one.t_us[np.argmax(fired)]) if fired.any() else None
-
-
-def _events(table: dict[str, MetricSeries], first_us: int, last_us: int) -> tuple[dict[str, Any], ...]:
-    found = [(name, _first_time(table[name], first_us)) for name in EVENTS if name in table]
-    return tuple({"metric": name, "t_us": t} for name, t in sorted(found, key=lambda e: e[1] or 0) if t is not None and t <= last_us)
 
 
 def _reduce(one: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str) -> RolloutValue:

@@ -11,7 +11,7 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.run_folder.columns import RendererColumns, RolloutTable
+from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.schema import cell_name
 from alpasim_plugin.run_folder.sides import RendererRows, Row, Side, by_renderer, failure_of, metric_names, reason_of
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
@@ -26,7 +26,7 @@ from evaluators.statistics.intervals import (
     wilson_rate,
     within,
 )
-from evaluators.statistics.paired import base_pairs_of_sides, paired_sides
+from evaluators.statistics.paired import base_pairs, paired_sides
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
@@ -98,32 +98,25 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
         entry["ci95_clustered_reason"] = interval.reason
     if interval.note:
         entry["note"] = interval.note
-    entry |= _bootstrap(metric.name, values, scenes, entry["n_scenes"])
+    if entry["n_scenes"] > BOOTSTRAP_SCENES:
+        why = f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"
+    else:
+        found = cluster_bootstrap(values, scenes, partial(_redraws, metric.name))
+        entry["ci95_bootstrap"], why = found.bounds, found.reason
+    if why:
+        entry["ci95_bootstrap_reason"] = why
     if metric.is_flag:
-        entry |= _counts(values)
+        k = int(np.sum(values > 0))
+        entry |= {"n_events": k, "ci95_wilson": None, "ci95_exact": None}
+        if bool(np.all((values == 0.0) | (values == 1.0))):  # as if rollouts were independent trials
+            entry["ci95_wilson"], entry["ci95_exact"] = list(wilson_rate(k, n)), list(exact_rate(k, n))
     return entry
-
-
-def _bootstrap(metric: str, values: F64, scenes: I64, n_scenes: int) -> dict[str, Any]:
-    if n_scenes > BOOTSTRAP_SCENES:
-        return {"ci95_bootstrap_reason": f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"}
-    found = cluster_bootstrap(values, scenes, partial(_redraws, metric))
-    return {"ci95_bootstrap": found.bounds} | ({"ci95_bootstrap_reason": found.reason} if found.reason else {})
 
 
 @lru_cache(maxsize=1)
 def _redraws(metric: str, scenes: int) -> I64:
     """Return the draws of a metric's scenes; keyed by the metric alone, so that renderers meet the same ones."""
     return redraws(scenes, stream(metric, 0, "aggregate/bootstrap"))
-
-
-def _counts(values: F64) -> dict[str, Any]:
-    """Return the count of events and, where every cell is 0 or 1, the bounds for independent trials."""
-    out: dict[str, Any] = {"n_events": int(np.sum(values > 0)), "ci95_wilson": None, "ci95_exact": None}
-    if bool(np.all((values == 0.0) | (values == 1.0))):
-        k, n = out["n_events"], len(values)
-        out["ci95_wilson"], out["ci95_exact"] = list(wilson_rate(k, n)), list(exact_rate(k, n))
-    return out
 
 
 STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")
@@ -170,7 +163,9 @@ def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -
         "bounds_rollouts": {},
         "cut": {},
     }
-    cut, scored = (np.array([_steps(row, rules) for row in side.rows], dtype=np.float64) for rules in (CUT_RULES, ("steps_scored",)))
+    steps = [row.get("censored") or {} for row in side.rows]
+    cut = np.array([sum(int(ledger.get(rule) or 0) for rule in CUT_RULES) for ledger in steps], dtype=np.float64)
+    scored = np.array([int(ledger.get("steps_scored") or 0) for ledger in steps], dtype=np.float64)
     for name in names:
         values = side.raw(name)
         absent = np.flatnonzero(side.ok & ~np.isfinite(values))
@@ -207,12 +202,6 @@ def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[lis
     return over_rollouts, [float(least.sum()) / n, (float(greatest.sum()) + missing) / n], int(np.sum(greatest > seen))
 
 
-def _steps(row: Row, rules: Sequence[str]) -> int:
-    ledger = row.get("censored") or {}
-    return sum(int(ledger.get(rule) or 0) for rule in rules)
-
-
-Sides = Mapping[str, RendererColumns]
 NO_BASES: Mapping[str, str] = {}
 
 
@@ -228,13 +217,18 @@ def numbers(
         known: What the metrics are.
     """
     sides = {policy: table.sides(policy) for policy in table.policies}
-    return {
-        "metrics": by_policy(sides, lambda some: aggregate_sides(some, table.metrics, known)),
-        "paired": by_policy(sides, lambda some: _pairs(some, table.metrics, baseline, known)),
-        "paired_with_base": by_policy(
-            sides, lambda some: base_pairs_of_sides(some, table.metrics, _baseline(some, baseline), bases, known)
-        ),
-    }
+    chosen: dict[str, str | None] = {}  # None where there is nothing to compare
+    for policy, here in sides.items():
+        first = next(iter(here), None) if len(here) > 1 else None
+        chosen[policy] = baseline if len(here) > 1 and baseline in here else first
+    metrics = {policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()}
+    paired, with_base = {}, {}
+    for policy, here in sides.items():
+        base = chosen[policy]
+        paired[policy] = {} if base is None else paired_sides(here, table.metrics, base, known=known)
+        with_base[policy] = base_pairs(here, table.metrics, base, bases, known)
+    parts = {"metrics": metrics, "paired": paired, "paired_with_base": with_base}
+    return {name: by_policy(part, dict) for name, part in parts.items()}
 
 
 def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> dict[str, Any]:
@@ -249,15 +243,3 @@ def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) 
         part = table(some)
         out |= part if len(of) == 1 else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
     return out
-
-
-def _pairs(sides: Sides, metrics: list[str], baseline: str | None, known: MetricTable) -> Mapping[str, Any]:
-    chosen = _baseline(sides, baseline)
-    return {} if chosen is None else paired_sides(sides, metrics, chosen, known=known)
-
-
-def _baseline(sides: Sides, baseline: str | None) -> str | None:
-    """Return the renderer that the others are compared with; None where there is nothing to compare."""
-    if len(sides) < 2:
-        return None
-    return baseline if baseline is not None and baseline in sides else next(iter(sides))

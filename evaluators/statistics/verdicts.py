@@ -109,15 +109,10 @@ def verdict(bounds: list[float] | None, p: float | None, margin: float, directio
         return "undecided"
     low, high = harm(bounds, direction)
     if direction == "none":
-        low, high = _distance_from_zero(low, high)
+        low, high = (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(abs(low), abs(high))  # how far from zero
     if high < margin or (margin == 0.0 and high == low == 0.0):
         return "non-inferior"
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
-
-
-def _distance_from_zero(low: float, high: float) -> tuple[float, float]:
-    """Return the least and greatest absolute value within bounds."""
-    return (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(abs(low), abs(high))
 
 
 def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.statistics.sequential import asymptotic, betting
 from evaluators.statistics.sequential.draws import Draws, independent
 from evaluators.statistics.sequential.line import Plan
-from evaluators.statistics.sequential.question import OPPOSITE, MetricQuestion, Question
+from evaluators.statistics.sequential.question import OPPOSITE, Look, MetricLook, MetricQuestion, Question
 from evaluators.statistics.verdicts import Cause, Outcome
 
 
@@ -50,13 +49,6 @@ def closed(log_e: F64) -> F64:
         return np.asarray(np.log(least) + finite)
 
 
-def closed_by_sets(e: F64) -> F64:
-    """Return the adjusted e-values ``(k,)`` by going through every set: the reference of `closed`."""
-    k = len(e)
-    sets = [s for size in range(1, k + 1) for s in combinations(range(k), size)]
-    return np.array([min(float(np.mean(e[list(s)])) for s in sets if i in s) for i in range(k)])
-
-
 Answer = Literal["good", "bad", "open"]
 
 
@@ -81,17 +73,6 @@ class MetricState:
     interval: tuple[float | None, float | None]
     e_good: float
     e_bad: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the state for JSON."""
-        return {
-            "verdict": self.answer,
-            "n_scenes": self.n_scenes,
-            "diff": self.diff,
-            "interval": list(self.interval),
-            "e_good": self.e_good,
-            "e_bad": self.e_bad,
-        }
 
 
 @dataclass(frozen=True)
@@ -151,6 +132,22 @@ def state_after(
         e_good, e_bad = (float(np.exp(min(path[i, -1], 700.0))) if n else 0.0 for path in (ever_good, ever_bad))
         states.append(MetricState(one.metric, words[_first(is_good[i], is_bad[i])], mine.draws.n, centre, (low, high), e_good, e_bad))
     return State(n, answer, tuple(states))
+
+
+def look_as_dict(state: State, rollouts: int, seeds: int) -> Look:
+    """Return a look for ``decision.json``."""
+    metrics: dict[str, MetricLook] = {
+        one.metric: {
+            "verdict": one.answer,
+            "n_scenes": one.n_scenes,
+            "diff": one.diff,
+            "interval": list(one.interval),
+            "e_good": one.e_good,
+            "e_bad": one.e_bad,
+        }
+        for one in state.metrics
+    }
+    return {"n_scenes": state.n_scenes, "rollouts": rollouts, "seeds": seeds, "answer": state.answer, "metrics": metrics}
 
 
 def outcome_of(question: Question, state: State, ceiling: str) -> Outcome:
@@ -220,11 +217,8 @@ class _Seen:
             found = float(asymptotic.lower_bound(draws, self.plan, self.first_look))
             return found if np.isfinite(found) else None
         least, most = sorted(sign * bound for bound in self.question.harm_bounds)
-        sizes = betting.bet_sizes(draws, self._centre(draws), self.plan)
+        sizes = betting.bet_sizes(draws, sign * self.question.threshold, self.plan)
         return float(betting.lower_bound(draws, sizes, self.plan.log_bar, least, most))
-
-    def _centre(self, draws: Draws) -> float:
-        return self.question.threshold if draws is self.draws else -self.question.threshold
 
 
 def _hold(path: F64, at: I64, n: int) -> F64:

@@ -14,9 +14,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Direction, MetricInfo
 from alpasim_plugin.io.checksums import read_sealed, write_sealed
 from alpasim_plugin.io.reading.files import as_shape
-from evaluators.metrics import METRICS, MetricTable
+from evaluators.metrics import METRICS
 from evaluators.statistics.sequential.asymptotic import FIRST_LOOK
-from evaluators.statistics.sequential.decision import State
 
 Asked = Literal["non-inferior", "better"]
 Method = Literal["betting", "asymptotic"]
@@ -118,7 +117,6 @@ def metric_question(
     expected: float | None = None,
     binding: bool = True,
     method: Method | None = None,
-    known: MetricTable = METRICS,
 ) -> MetricQuestion:
     """Make the question about one metric.
 
@@ -129,12 +127,11 @@ def metric_question(
         expected: Expected difference, candidate minus baseline in the metric's own sign.
         binding: As in `MetricQuestion`.
         method: None: betting where differences are bounded, else asymptotic.
-        known: The metrics that can be asked about.
 
     Raises:
         InputError: A negative margin, a metric without a better side for which none is possible, or betting on unbounded differences.
     """
-    facts = known.info(metric)
+    facts = METRICS.info(metric)
     direction = facts.direction
     chosen = margin if margin is not None else facts.accepted if asked == "non-inferior" else 0.0
     if chosen < 0.0 or not math.isfinite(chosen):
@@ -244,12 +241,6 @@ def question_as_dict(question: Question) -> AskedRecord:
             for one in question.metrics
         },
     }
-
-
-def look_as_dict(state: State, rollouts: int, seeds: int) -> Look:
-    """Return a look for JSON."""
-    metrics: dict[str, Any] = {one.metric: one.as_dict() for one in state.metrics}
-    return {"n_scenes": state.n_scenes, "rollouts": rollouts, "seeds": seeds, "answer": state.answer, "metrics": metrics}
 
 
 def write_decision(root: Path, decision: Decision) -> None:
