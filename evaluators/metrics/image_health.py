@@ -33,7 +33,14 @@ def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     """Give ``img_is_black`` and ``img_is_frozen``, one row per image time: 1 if any camera's image of that time is. No images, no rows."""
     images = [image for image in rollout.images if preset.image_camera in (None, image.camera)]
     if preset.image_rule == "at_or_after_step":
-        return _at_or_after_steps(images, rollout)
+        if not images:
+            return []
+        # The first image at or after each ego time; times after the last image have no row.
+        images = sorted(images, key=lambda image: image.end_us)
+        ends = np.array([image.end_us for image in images], dtype=np.int64)
+        is_dark = np.array([is_black(decode(image)) for image in images], dtype=np.float64)
+        times = rollout.ego.t_us[rollout.ego.t_us <= ends[-1]]
+        return [series("img_is_black", times, is_dark[np.searchsorted(ends, times, side="left")])]
     black: dict[int, bool] = {}
     for image in images:
         black[image.end_us] = black.get(image.end_us, False) or is_black(decode(image))
@@ -59,17 +66,6 @@ def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]
         if float(np.hypot(*(np.diff(e)[0] for e in ends))) > FROZEN_MOVE_M:
             found.add(image.end_us)
     return found
-
-
-def _at_or_after_steps(images: list[LoggedImage], rollout: RolloutLog) -> list[MetricSeries]:
-    """Give the first image at or after each ego time; times after the last image have no row. Without images there is no series."""
-    if not images:
-        return []
-    images = sorted(images, key=lambda image: image.end_us)
-    black = np.array([is_black(decode(image)) for image in images], dtype=np.float64)
-    ends = np.array([image.end_us for image in images], dtype=np.int64)
-    t_us = rollout.ego.t_us[rollout.ego.t_us <= ends[-1]]
-    return [series("img_is_black", t_us, black[np.searchsorted(ends, t_us, side="left")])]
 
 
 FACTORY = with_preset(evaluate_images)

@@ -68,10 +68,13 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
     left_out: list[str] = []
     spent = 0
     for scene in scenes:
-        found = _best_cell(run, scene)
-        if found is None:
+        cells: dict[tuple[str, int], list[Rollout]] = {}
+        for rollout in run.by_scene.get(scene, ()):
+            if run.file_of(rollout, "strip.jpg") is not None:
+                cells.setdefault((rollout.policy, rollout.seed), []).append(rollout)
+        if not cells:
             continue
-        policy, seed, members = found
+        (policy, seed), members = max(cells.items(), key=lambda item: len(item[1]))  # the first of equals
         if shown and (len(shown) >= limit or spent >= budget_bytes):
             left_out.append(scene)
             continue
@@ -84,17 +87,6 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
         shown.append(comparison)
         spent += comparison.n_bytes
     return shown, left_out
-
-
-def _best_cell(run: Run, scene: str) -> tuple[str, int, list[Rollout]] | None:
-    cells: dict[tuple[str, int], list[Rollout]] = {}
-    for rollout in run.by_scene.get(scene, ()):
-        if run.file_of(rollout, "strip.jpg") is not None:
-            cells.setdefault((rollout.policy, rollout.seed), []).append(rollout)
-    if not cells:
-        return None
-    (policy, seed), members = max(cells.items(), key=lambda item: len(item[1]))  # the first of equals
-    return policy, seed, members
 
 
 def _comparison(run: Run, scene: str, policy: str, seed: int, members: list[Rollout]) -> Comparison | None:

@@ -13,7 +13,6 @@ import json
 import os
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
@@ -205,17 +204,12 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> Bytes:
         if rollout.ok:
             state |= (COLLIDED if rollout.flag(*COLLISION) else 0) | (LEFT_ROAD if rollout.flag("offroad") else 0)
         if parent not in names:
-            names[parent] = _folders(run.folder, parent)
+            names[parent] = frozenset()
+            path = run.folder / parent
+            if parent and path.is_dir() and path.resolve().is_relative_to(run.folder.resolve()):  # links may lead out of the run
+                with os.scandir(path) as found:
+                    names[parent] = frozenset(one.name for one in found if one.is_dir(follow_symlinks=False))
         if leaf in names[parent]:
             state |= HAS_FOLDER | (HAS_CLIP if has_clips and (run.folder / parent / leaf / CLIP).is_file() else 0)
         states.append(state)
     return np.array(states, dtype=np.uint8)
-
-
-def _folders(root: Path, parent: str) -> frozenset[str]:
-    """Return the folders in a folder of the run; none where it is not there or leads out of the run."""
-    path = root / parent
-    if not parent or not path.is_dir() or not path.resolve().is_relative_to(root.resolve()):
-        return frozenset()
-    with os.scandir(path) as found:
-        return frozenset(one.name for one in found if one.is_dir(follow_symlinks=False))

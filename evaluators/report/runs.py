@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
@@ -151,10 +152,11 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     info: Mapping[str, Any] = {}
     problem = ""
     try:
-        info = _run_info(folder / RUN_INFO)
+        info = _run_info(folder / RUN_INFO, is_copy=False)
     except InputError as error:
         problem = f"{RUN_INFO}: {error.found}"
-        info = _copy_of(folder) if finished else info
+        with suppress(InputError):  # the copy may be damaged too
+            info = _run_info(folder / CONTENTS, is_copy=True) if finished else info
     if problem or not finished:
         if holder_of(folder / LOCK) is not None:
             return RunEntry(folder, "running", "", info)
@@ -171,20 +173,10 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     return entry
 
 
-def _run_info(path: Path) -> Mapping[str, Any]:
-    info, _ = read_sealed(path, DOING, CHECK)
-    shaped: Mapping[str, Any] = as_shape(RunInfo, info, path, DOING, CHECK)
+def _run_info(path: Path, is_copy: bool) -> Mapping[str, Any]:
+    content, _ = read_sealed(path, DOING, CHECK)
+    shaped: Mapping[str, Any] = as_shape(RunInfo, (content.get("run") or {}) if is_copy else content, path, DOING, CHECK)
     return shaped
-
-
-def _copy_of(folder: Path) -> Mapping[str, Any]:
-    """Return the copy of a damaged ``run.json``; empty where it is damaged too."""
-    try:
-        contents, _ = read_sealed(folder / CONTENTS, DOING, CHECK)
-        copy: Mapping[str, Any] = as_shape(RunInfo, contents.get("run") or {}, folder / CONTENTS, DOING, CHECK)
-    except InputError:
-        return {}
-    return copy
 
 
 MARKS = frozenset((RUN_INFO, CONTENTS, LOCK))  # the first file of a run folder is its lock

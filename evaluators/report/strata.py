@@ -99,11 +99,12 @@ def strata(run: Run, scenes: Sequence[str] | None = None) -> list[Strata]:
         found.append(_split("By distance from the logged path", note, "distance from the path", "m", labels, steps, groups, run))
     covered = [one for one in steps if one.opacity is not None]
     if covered:
-        every = np.concatenate([one.opacity[np.isfinite(one.opacity)] for one in covered if one.opacity is not None])
+        seen = [np.asarray(one.opacity) for one in covered]
+        every = np.concatenate([values[np.isfinite(values)] for values in seen])
         quartiles = np.floor(np.percentile(every, OPACITY_SHARES) * 1000) / 1000 if every.size else ()  # down: 0.9996 is not 1
         edges = tuple(dict.fromkeys(float(v) for v in quartiles))
         note = "Opacity: mean over the picture of what the Gaussians cover; little means sky, or holes. Limits are quartiles of this run."
-        groups = [one.opacity_bin(edges) for one in covered]
+        groups = [np.where(np.isfinite(values), np.digitize(values, edges), -1) for values in seen]
         found.append(_split("By rendered opacity", note, "rendered opacity", "", _labels(edges, ""), covered, groups, run))
     return found
 
@@ -164,10 +165,6 @@ class _Steps:
         beside = (at < len(times)) & (times[np.minimum(at, len(times) - 1)] == self.t_us)
         found = np.digitize(np.abs(values[np.minimum(at, len(times) - 1)]), DISTANCE_EDGES_M)
         return np.where(beside, found, len(DISTANCE_EDGES_M) + 1)
-
-    def opacity_bin(self, edges: Sequence[float]) -> I64:
-        assert self.opacity is not None
-        return np.where(np.isfinite(self.opacity), np.digitize(self.opacity, edges), -1)
 
     def values(self, name: str, group: I64, k: int) -> F64:
         """Return the values of a metric at the steps of one group; times without a value have none."""

@@ -58,12 +58,17 @@ def changes(before: RunEntry, after: RunEntry, renderer: str, policy: str) -> tu
         policy: Behind what it drives.
     """
     sides = (before, after)
+    options = []
+    for one in sides:
+        config = one.info.get("config") or {}
+        driven = {f"--{name}": value for name, value in config.items() if name not in NO_EFFECT}
+        options.append(driven if one.kind == "run" else config)
     found = [
         *_differences("weights", *(_weights(one, renderer, policy) for one in sides)),
         *(one for key in ("settings", "digest") for one in _parts(*sides, renderer, policy, key)),
         *_differences("code of the", *(one.info.get("code") or {} for one in sides)),
         *_differences("", *(_scenes(one, renderer) for one in sides)),
-        *_differences("", *(_options(one) for one in sides)),
+        *_differences("", *options),
         *_differences("", *({"commit": one.commit_text or None, "simrun": one.info.get("version")} for one in sides)),
         *_differences("version of", *(one.info.get("versions") or {} for one in sides)),
         *_differences("machine:", *(one.info.get("hardware") or {} for one in sides)),
@@ -140,11 +145,6 @@ def _scenes(entry: RunEntry, renderer: str) -> dict[str, Any]:
         scenes = entry.info.get("scenes") or {}
         found |= {f"reconstruction of {name}": (facts.get("reconstruction") or "")[:12] or None for name, facts in scenes.items()}
     return found
-
-
-def _options(entry: RunEntry) -> dict[str, Any]:
-    config = entry.info.get("config") or {}
-    return {f"--{name}": value for name, value in config.items() if name not in NO_EFFECT} if entry.kind == "run" else dict(config)
 
 
 DOING = "comparing many runs"
@@ -252,13 +252,22 @@ def trend(entries: Sequence[RunEntry], metrics: Sequence[str]) -> Trend:
     Raises:
         InputError: A table of a run is damaged, or a metric is not the same quantity in two runs that are compared.
     """
-    usable, left_out = _usable(entries)
+    left_out: list[tuple[RunEntry, str]] = []
     groups: dict[Setting, list[RunEntry]] = {}
-    for entry in usable:
-        for setting in _settings(entry):
-            groups.setdefault(setting, []).append(entry)
+    for entry in entries:
+        if entry.state != "finished":
+            left_out.append((entry, entry.state))
+        elif entry.kind == "fork":
+            left_out.append((entry, "a fork of one rollout"))
+        elif not entry.scenes or not all(entry.scenes.values()):
+            left_out.append((entry, "no content hash of its scenes"))
+        else:
+            for setting in _settings(entry):
+                groups.setdefault(setting, []).append(entry)
+    refused = {id(one) for one, _ in left_out}
     joined = {id(one): one for runs in groups.values() if len(runs) > 1 for one in runs}
-    left_out += [(one, "no other run has its scenes, seeds, policy and preset") for one in usable if id(one) not in joined]
+    alone = [one for one in entries if id(one) not in joined and id(one) not in refused]
+    left_out += [(one, "no other run has its scenes, seeds, policy and preset") for one in alone]
     by_commit = bool(joined) and all(as_time(one.project.get("committed_at")) is not None for one in joined.values())
     tables = _Tables(metrics)
 
@@ -270,21 +279,6 @@ def trend(entries: Sequence[RunEntry], metrics: Sequence[str]) -> Trend:
 
     series = [_series(setting, sorted(runs, key=order), metrics, tables) for setting, runs in groups.items() if len(runs) > 1]
     return Trend(tuple(sorted(series, key=lambda one: -len(one.runs))), tuple(left_out), by_commit)
-
-
-def _usable(entries: Sequence[RunEntry]) -> tuple[list[RunEntry], list[tuple[RunEntry, str]]]:
-    usable: list[RunEntry] = []
-    left_out: list[tuple[RunEntry, str]] = []
-    for entry in entries:
-        if entry.state != "finished":
-            left_out.append((entry, entry.state))
-        elif entry.kind == "fork":
-            left_out.append((entry, "a fork of one rollout"))
-        elif not entry.scenes or not all(entry.scenes.values()):
-            left_out.append((entry, "no content hash of its scenes"))
-        else:
-            usable.append(entry)
-    return usable, left_out
 
 
 def _settings(entry: RunEntry) -> list[Setting]:
@@ -325,25 +319,21 @@ class _Tables:
         """Return the rollouts of a renderer and policy, sorted into cells."""
         key = (id(entry), renderer, policy)
         if key not in self._sides:
-            self._sides[key] = RendererRows.of(self._of(entry)[renderer, policy])
+            self._sides[key] = RendererRows.of(self._split(entry)[renderer, policy])
         return self._sides[key]
 
     def has(self, entry: RunEntry, renderer: str, policy: str, metric: str) -> bool:
         """Tell whether a run's renderer and policy have a metric, valid or not."""
-        rows = self._of(entry).get((renderer, policy), [])
+        rows = self._split(entry).get((renderer, policy), [])
         return bool(rows) and metric in rows[0]
 
-    def _of(self, entry: RunEntry) -> dict[tuple[str, str], list[Row]]:
-        if id(entry) not in self._read:
-            self._read[id(entry)] = self._split(entry)
-        return self._read[id(entry)]
-
     def _split(self, entry: RunEntry) -> dict[tuple[str, str], list[Row]]:
-        stated = {name for table in (entry.summary.get("metrics") or {}).values() for name in table}
-        metrics = [name for name in self._metrics if name in stated]
-        columns = [*ROLLOUTS_TABLE.required, *(column.name for column in columns_of(metrics))]
-        table = ROLLOUTS_TABLE.read(entry.folder / ROLLOUTS, DOING, CHECK, columns)
-        split: dict[tuple[str, str], list[Row]] = {}
-        for row in table.to_pylist():
-            split.setdefault((row["renderer"], row["policy"]), []).append(row)
-        return split
+        if id(entry) not in self._read:
+            stated = {name for table in (entry.summary.get("metrics") or {}).values() for name in table}
+            metrics = [name for name in self._metrics if name in stated]
+            columns = [*ROLLOUTS_TABLE.required, *(column.name for column in columns_of(metrics))]
+            split: dict[tuple[str, str], list[Row]] = {}
+            for row in ROLLOUTS_TABLE.read(entry.folder / ROLLOUTS, DOING, CHECK, columns).to_pylist():
+                split.setdefault((row["renderer"], row["policy"]), []).append(row)
+            self._read[id(entry)] = split
+        return self._read[id(entry)]

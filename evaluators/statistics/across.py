@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,7 +71,14 @@ def compare_runs(
         raise InputError(DOING, both, f"presets {presets[0]!r} and {presets[1]!r}", "give the command of one run again with --preset")
     check_scenes(scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files")
     table, base = table_of_run(second), table_of_run(first)
-    partner_of, notes = _align_policies(base.policies, table.policies)
+    partner_of = {policy: policy for policy in table.policies if policy in base.policies}
+    notes: tuple[str, ...] = ()
+    if not partner_of:
+        theirs, ours = base.policies, table.policies
+        if len(theirs) != 1 or len(ours) != 1:
+            do = "compare runs of one policy each, or of the same policies"
+            raise InputError(DOING, f"policies {theirs} and {ours}", "none in common", do)
+        partner_of, notes = {ours[0]: theirs[0]}, (f"policy {ours[0]} is compared with policy {theirs[0]}",)
     there, here = base.renderers, table.renderers
     if baseline is not None and baseline not in there:
         raise InputError(DOING, f"baseline {baseline!r}", f"{first.folder} does not have it", f"choose one of {', '.join(there)}")
@@ -118,12 +125,3 @@ def _pairs(
                     for name in dict.fromkeys([*table.metrics, *base.metrics])
                 }
     return out
-
-
-def _align_policies(there: Sequence[str], here: Sequence[str]) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return for each of the second run's policies the first's: of the same name, or where they share none its only one."""
-    if set(there) & set(here):
-        return {policy: policy for policy in here if policy in there}, ()
-    if len(there) == len(here) == 1:
-        return {here[0]: there[0]}, (f"policy {here[0]} is compared with policy {there[0]}",)
-    raise InputError(DOING, f"policies {there} and {here}", "none in common", "compare runs of one policy each, or of the same policies")

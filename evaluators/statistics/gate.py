@@ -187,7 +187,11 @@ def judge_sides(
     for policy, here in sides.items():
         there = here if stored is None else stored.get(policy, {})
         for renderer in _judged(here, spec, stored is not None):
-            base = _baseline_name(renderer, here, there, spec, stored is not None)
+            base = spec.baseline or (renderer if stored is not None else next(iter(here)))
+            if base not in there and any(rule.margin is not None for rule in spec.metrics.values()):
+                where = "the stored baseline" if stored is not None else "the run"
+                others = ", ".join(there) or "no rollout of this policy"
+                raise InputError("judging a run", f"baseline {base!r}", f"{where} does not have it", f"choose one of: {others}")
             for name, rule in spec.metrics.items():
                 metric, side = known.info(name), here[renderer]
                 if rule.margin is not None:
@@ -224,22 +228,10 @@ def _judged(here: Sides, spec: GateSpec, has_stored: bool) -> list[str]:
         return list(here)
     base = spec.baseline or next(iter(here))
     judged = [name for name in here if name != base]
-    if judged:
-        return judged
-    if any(rule.margin is not None for rule in spec.metrics.values()):  # a gate of limits alone needs no second renderer
+    if not judged and any(rule.margin is not None for rule in spec.metrics.values()):
         do = "run two renderers, or give --baseline-file"
         raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", do)
-    return [base]
-
-
-def _baseline_name(renderer: str, here: Sides, there: Sides, spec: GateSpec, has_stored: bool) -> str:
-    name = spec.baseline or (renderer if has_stored else next(iter(here)))
-    needs = any(rule.margin is not None for rule in spec.metrics.values())
-    if needs and name not in there:
-        where = "the stored baseline" if has_stored else "the run"
-        known = ", ".join(there) or "no rollout of this policy"
-        raise InputError("judging a run", f"baseline {name!r}", f"{where} does not have it", f"choose one of: {known}")
-    return name
+    return judged or [base]  # a gate of limits alone needs no second renderer
 
 
 def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec) -> Check:
