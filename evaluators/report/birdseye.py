@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.rows import Rollout, Series
 from evaluators.report.numbers import fixed
 from evaluators.report.rollouts import Event, clock_zero_us, events_of
 
-F64 = npt.NDArray[np.float64]
 Variants = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
@@ -220,7 +219,7 @@ def scene_view(
     )
 
 
-def _moment(logged: Sequence[npt.NDArray[np.int64]], events: Sequence[Event], zero_us: int) -> tuple[int, str]:
+def _moment(logged: Sequence[I64], events: Sequence[Event], zero_us: int) -> tuple[int, str]:
     """Return when road users are drawn: at the scene's first event, else half way through.
 
     Args:

@@ -11,13 +11,13 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-import numpy.typing as npt
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.run_folder.rows import Rollout, Series
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import MetricInfo
@@ -76,10 +76,10 @@ class Curve:
     label: str
     colour: int
     dash: int
-    x: npt.NDArray[np.float64]
-    y: npt.NDArray[np.float64]
-    low: npt.NDArray[np.float64] | None = None
-    high: npt.NDArray[np.float64] | None = None
+    x: F64
+    y: F64
+    low: F64 | None = None
+    high: F64 | None = None
 
 
 def new_axes(
@@ -147,7 +147,7 @@ def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[t
         return []
     several = len({policy for _, policy in by_variant}) > 1
 
-    def curves(make: Callable[[list[Rollout]], tuple[npt.NDArray[np.float64], ...]]) -> list[Curve]:
+    def curves(make: Callable[[list[Rollout]], tuple[F64, ...]]) -> list[Curve]:
         names = {key: " \u00b7 ".join(key) if several else key[0] for key in by_variant}
         return [Curve(names[key], *variant_of[key], *make(members)) for key, members in by_variant.items()]
 
@@ -168,7 +168,7 @@ def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[t
     return charts
 
 
-def _offset_band(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np.float64], ...]:
+def _offset_band(members: list[Rollout], series: Series) -> tuple[F64, ...]:
     own = [series[r.cell]["lateral_bias_m"] for r in members]
     end_s = max(float(t[-1] - t[0]) for t, _ in own) * 1e-6
     grid = np.linspace(0.0, end_s, N_BINS)
@@ -182,7 +182,7 @@ def _offset_band(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np
     return grid[enough], middle, low, high
 
 
-def _survival(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np.float64], ...]:
+def _survival(members: list[Rollout], series: Series) -> tuple[F64, ...]:
     ends = [series[r.cell]["lateral_bias_m"][0] for r in members]
     end_s = max(float(t[-1] - t[0]) for t in ends) * 1e-6
     firsts = [min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=np.inf) for r in members]

@@ -149,7 +149,9 @@ def junit(run: Run) -> ET.Element:
         "time": f"{sum(r.wall_s or 0.0 for r in run.rollouts):.3f}",
     }
     root = ET.Element("testsuites", {"name": "simrun", **counts})
-    suite = ET.SubElement(root, "testsuite", {"name": clean(_suite_name(run)), **counts})
+    asked = run.info.get("asked") or []
+    name = str(asked[0]) if len(asked) == 1 else run.folder.resolve().name  # what the command named, where that was one thing
+    suite = ET.SubElement(root, "testsuite", {"name": clean(name), **counts})
     if run.info.get("started_at"):
         suite.set("timestamp", clean(str(run.info["started_at"])))
     facts = {
@@ -163,12 +165,6 @@ def junit(run: Run) -> ET.Element:
     for rollout in run.rollouts:
         _case(suite, rollout, with_values)
     return root
-
-
-def _suite_name(run: Run) -> str:
-    """Return the suite or scenario that the command named, where it was one; a list of them has the name of the run's folder."""
-    asked = run.info.get("asked") or []
-    return str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
 
 
 def _case(suite: ET.Element, rollout: Rollout, with_values: bool) -> None:

@@ -11,14 +11,15 @@ import base64
 import gzip
 import json
 import os
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.types import U8
 from alpasim_plugin.run_folder.rows import Own, Rollout, Series, series_by_cell
 from evaluators.opening import Run
 
@@ -119,9 +120,6 @@ KEPT_BITS = 13  # of a number's mantissa
 COLLIDED, LEFT_ROAD, FAILED, HAS_FOLDER, HAS_CLIP = (1 << bit for bit in range(5))
 CLIP = "front.mp4"
 
-T = TypeVar("T", bound=Hashable)
-Bytes = npt.NDArray[np.uint8]
-
 
 @dataclass(frozen=True)
 class RolloutBlock:
@@ -149,7 +147,7 @@ def rollout_block(run: Run) -> RolloutBlock:
     rollouts = run.rollouts[:MAX_ROLLOUTS]
     parents = [os.path.split(r.path) for r in rollouts]
     header: list[dict[str, Any]] = []
-    columns: list[Bytes] = []
+    columns: list[U8] = []
 
     def add(name: str, kind: str, data: npt.NDArray[Any], **more: Any) -> None:
         header.append({"name": name, "type": kind} | more)
@@ -180,9 +178,9 @@ def rollout_block(run: Run) -> RolloutBlock:
     return RolloutBlock(base64.b64encode(packed).decode(), len(rollouts), len(run.rollouts) - len(rollouts))
 
 
-def _coded(values: Iterable[T]) -> tuple[npt.NDArray[np.uint32], list[T]]:
+def _coded(values: Iterable[str]) -> tuple[npt.NDArray[np.uint32], list[str]]:
     """Return the number of each value ``(N,)``, and the values in order of appearance."""
-    known: dict[T, int] = {}
+    known: dict[str, int] = {}
     codes = [known.setdefault(value, len(known)) for value in values]
     return np.array(codes, dtype="<u4"), list(known)
 
@@ -194,7 +192,7 @@ def _rounded(values: Sequence[float | None]) -> npt.NDArray[np.float32]:
     return np.asarray(np.ldexp(np.round(np.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS), dtype="<f4")
 
 
-def _states(run: Run, parents: Sequence[tuple[str, str]]) -> Bytes:
+def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
     """Return what each rollout ended with, and which files of it are there, as bits."""
     has_clips = str((run.info.get("config") or {}).get("video") or "none") != "none"
     names: dict[str, frozenset[str]] = {}

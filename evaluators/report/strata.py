@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import matplotlib as mpl
 import numpy as np
-import numpy.typing as npt
 
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.metrics import METRICS
 from evaluators.opening import Run
@@ -27,9 +27,6 @@ SERIES = (DISTANCE, OPACITY, *VALUES, *COLLISION, "offroad", "eval_relevant")
 NOT_BESIDE = "not beside the path"
 LEAST_STEPS = 10  # fewer steps in a stratum give no mean
 LEAST_SCENES = 3  # fewer scenes give no interval
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

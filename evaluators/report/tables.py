@@ -94,7 +94,9 @@ def metric_rows(
         facts = known.shown(name)
         percent = facts.in_percent
         reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
-        places = 1 if percent else _places(entries)
+        halves = [h for e in entries if (h := finite(e.get("ci95")))]
+        means = [m for e in entries if (m := finite(e.get("mean")))]
+        places = 1 if percent else max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
         cells = tuple(metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True))
         spans, scale_text = _spans(entries, 100.0 if percent else 1.0, facts.is_flag, "%" if percent else unit)
         rows.append(
@@ -140,12 +142,6 @@ def metric_cell(metric: MetricInfo, entry: Mapping[str, Any], places: int, reaso
         notes.append(str(entry["note"]))
     count = count_of(mean, n_rollouts) if metric.is_flag else ""
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
-
-
-def _places(entries: list[Mapping[str, Any]]) -> int:
-    halves = [h for e in entries if (h := finite(e.get("ci95")))]
-    means = [m for e in entries if (m := finite(e.get("mean")))]
-    return max(decimals(*means, digits=3), decimals(*halves, digits=2)) if halves else decimals(*means, digits=3)
 
 
 def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str) -> tuple[tuple[Span | None, ...], str]:

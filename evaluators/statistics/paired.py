@@ -18,6 +18,8 @@ from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.intervals import Interval, cluster_means, logit_t_bounds, n_clusters, t_bounds, t_interval, within
 from evaluators.statistics.verdicts import LEAST_DECIDED_FLAGS, difference, harm, more_scenes, p_value, sign_test, verdict
 
+Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
+
 LISTED = 50  # missing cells named per metric; the count is always whole
 NO_PAIR = "no scene-seed cell has this metric on both sides"
 
@@ -29,7 +31,7 @@ def paired(
     margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
     known: MetricTable = METRICS,
-) -> dict[str, dict[str, dict[str, Any]]]:
+) -> Table:
     """Compare every renderer with a baseline, cell by cell.
 
     Args:
@@ -56,7 +58,7 @@ def paired_sides(
     margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
     known: MetricTable = METRICS,
-) -> dict[str, dict[str, dict[str, Any]]]:
+) -> Table:
     """Compare every renderer with a baseline; see `paired`.
 
     Args:
@@ -78,7 +80,7 @@ def paired_sides(
 
 def base_pairs(
     sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str], known: MetricTable = METRICS
-) -> dict[str, dict[str, dict[str, Any]]]:
+) -> Table:
     """Compare every renderer with a fixer with the renderer below it: what the fixer itself does.
 
     Args:

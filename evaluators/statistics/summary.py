@@ -26,21 +26,18 @@ from evaluators.statistics.intervals import (
     wilson_rate,
     within,
 )
-from evaluators.statistics.paired import base_pairs, paired_sides
+from evaluators.statistics.paired import Table, base_pairs, paired_sides
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
 
-def aggregate(
-    rows: Sequence[Row], metrics: Sequence[str] | None = None, known: MetricTable = METRICS
-) -> dict[str, dict[str, dict[str, Any]]]:
+def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
     """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 % interval.
 
     Args:
         rows: One mapping per rollout with ``renderer``, ``policy``, ``scene``, ``seed``, ``status`` and the metrics, either flat
             (``METRIC``, ``METRIC_valid``) or under ``metrics``. Rows whose status is not "ok" and invalid values do not enter.
-        metrics: Which metrics; all that any row has by default.
-        known: What they are.
+        known: What the metrics are.
 
     Returns:
         RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered`` ([low, high], scenes as clusters) and
@@ -49,12 +46,10 @@ def aggregate(
         independent). What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
         ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
     """
-    return aggregate_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics, known)
+    return aggregate_sides(by_renderer(rows), metric_names(rows), known)
 
 
-def aggregate_sides(
-    sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS
-) -> dict[str, dict[str, dict[str, Any]]]:
+def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS) -> Table:
     """Average rollouts per renderer and metric; see `aggregate`.
 
     Args:

@@ -120,7 +120,7 @@ def test_nested_metrics_as_in_manifests_are_read_too():
             "scene": s,
             "seed": 0,
             "status": "ok",
-            "metrics": {"offroad": {"value": v, "valid": v is not None}},
+            "metrics": {"offroad": {"value": v, "valid": v is not None, "reason": ""}},
         }
         for s, v in (("x", 1.0), ("y", 0.0), ("z", None))
     ]
