@@ -73,7 +73,8 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     contacts, gap_m = find_contacts(ego, actors, t_us)
     if preset.hits == "last":
         contacts = last_per_step(contacts, ego, actors, t_us)
-    step, side, first = contacts.step, contacts.side, []
+    step, side = contacts.step, contacts.side
+    first: list[MetricSeries] = []
     if preset.contact == "between_steps":
         swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
         step, side, first = swept.step, swept.side, _first_contacts(rollout, swept)

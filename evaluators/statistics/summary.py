@@ -217,7 +217,8 @@ def numbers(
         first = next(iter(here), None) if len(here) > 1 else None
         chosen[policy] = baseline if len(here) > 1 and baseline in here else first
     metrics = {policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()}
-    paired, with_base = {}, {}
+    paired: dict[str, Table] = {}
+    with_base: dict[str, Table] = {}
     for policy, here in sides.items():
         base = chosen[policy]
         paired[policy] = {} if base is None else paired_sides(here, table.metrics, base, known=known)
