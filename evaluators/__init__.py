@@ -11,64 +11,28 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.lazy import lazy_names
-from evaluators.aggregate.summary import aggregate  # not on first use: its package bears the same name
 
 if TYPE_CHECKING:
-    from evaluators.aggregate.censoring import censoring as censoring
-    from evaluators.aggregate.paired import paired as paired
-    from evaluators.aggregate.reduce import Reduction as Reduction
-    from evaluators.aggregate.reduce import RolloutValue as RolloutValue
-    from evaluators.aggregate.reduce import reduce_rollout as reduce_rollout
-    from evaluators.aggregate.reduce import rollout_values as rollout_values
-    from evaluators.base import resolve_evaluators as resolve_evaluators
-    from evaluators.base import score as score
-    from evaluators.base import series as series
-    from evaluators.collision import ContactEvent as ContactEvent
-    from evaluators.collision import contact_events as contact_events
-    from evaluators.metrics import METRICS as METRICS
-    from evaluators.metrics import MetricInfo as MetricInfo
-    from evaluators.presets import PRESETS as PRESETS
-    from evaluators.presets import Preset as Preset
-    from evaluators.presets import preset as preset
+    from evaluators.metrics import METRICS, MetricInfo
+    from evaluators.metrics.collision import ContactEvent, contact_events
+    from evaluators.metrics.presets import PRESETS, Preset, preset
+    from evaluators.metrics.score import resolve_evaluators, score, series
+    from evaluators.statistics.paired import paired
+    from evaluators.statistics.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
+    from evaluators.statistics.summary import aggregate, censoring
 
 __all__ = [
-    "METRICS",
-    "PRESETS",
-    "ContactEvent",
-    "MetricInfo",
-    "Preset",
-    "Reduction",
-    "RolloutValue",
-    "aggregate",
-    "censoring",
-    "contact_events",
-    "paired",
-    "preset",
-    "reduce_rollout",
-    "resolve_evaluators",
-    "rollout_values",
-    "score",
-    "series",
-]
+    "METRICS", "PRESETS", "ContactEvent", "MetricInfo", "Preset", "Reduction", "RolloutValue", "aggregate", "censoring", "contact_events",
+    "paired", "preset", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series",
+]  # fmt: skip
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "ContactEvent": ".collision",
-        "METRICS": ".metrics",
-        "MetricInfo": ".metrics",
-        "PRESETS": ".presets",
-        "Preset": ".presets",
-        "Reduction": ".aggregate.reduce",
-        "RolloutValue": ".aggregate.reduce",
-        "censoring": ".aggregate.censoring",
-        "contact_events": ".collision",
-        "paired": ".aggregate.paired",
-        "preset": ".presets",
-        "reduce_rollout": ".aggregate.reduce",
-        "resolve_evaluators": ".base",
-        "rollout_values": ".aggregate.reduce",
-        "score": ".base",
-        "series": ".base",
-    },
-)
+_HOMES = {
+    ".metrics": ("METRICS", "MetricInfo"),
+    ".metrics.collision": ("ContactEvent", "contact_events"),
+    ".metrics.presets": ("PRESETS", "Preset", "preset"),
+    ".metrics.score": ("resolve_evaluators", "score", "series"),
+    ".statistics.paired": ("paired",),
+    ".statistics.reduce": ("Reduction", "RolloutValue", "reduce_rollout", "rollout_values"),
+    ".statistics.summary": ("aggregate", "censoring"),
+}
+__getattr__ = lazy_names(__name__, {name: home for home, names in _HOMES.items() for name in names})

@@ -12,13 +12,13 @@ from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runtime.repair import use_run
-from evaluators.gate.across import Comparison, compare_runs, compare_within
-from evaluators.gate.spec import load_gate
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
-from evaluators.sequential.record import stopping_note
+from evaluators.statistics.across import Comparison, compare_runs, compare_within
+from evaluators.statistics.gate import load_gate
+from evaluators.statistics.sequential.question import stopping_note
 
 EPILOG = """
 Examples:

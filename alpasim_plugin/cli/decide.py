@@ -20,15 +20,15 @@ from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.run_folder.schema import slug
 from alpasim_plugin.runtime.decide import Decided, Design, execute_decision, key_of
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan
-from evaluators.gate import GateSpec, check_made_alike, load_gate, read_baseline, rows_of_run
-from evaluators.gate.stored import StoredSide, stored_side
 from evaluators.opening import read_run
 from evaluators.report.decision import metric_lines, verdict_line
-from evaluators.sequential import control as variance
-from evaluators.sequential.asymptotic import FIRST_LOOK
-from evaluators.sequential.control import Control
-from evaluators.sequential.decision import State
-from evaluators.sequential.question import Method, MetricQuestion, Order, Population, Question, metric_question
+from evaluators.statistics.baselines import StoredSide, check_made_alike, read_baseline, rows_of_run, stored_side
+from evaluators.statistics.gate import GateSpec, load_gate
+from evaluators.statistics.sequential import control as variance
+from evaluators.statistics.sequential.asymptotic import FIRST_LOOK
+from evaluators.statistics.sequential.control import Control
+from evaluators.statistics.sequential.decision import State
+from evaluators.statistics.sequential.question import Method, MetricQuestion, Order, Population, Question, metric_question
 
 DOING = "planning a decision"
 AUTO = "auto:"

@@ -30,21 +30,12 @@ from alpasim_plugin.runtime.decide import Design
 from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
-from evaluators.gate import (
-    GateVerdict,
-    check_matches,
-    judge_decided,
-    judge_table,
-    load_gate,
-    read_baseline,
-    rows_of_run,
-    table_of_run,
-    write_baseline,
-)
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
-from evaluators.sequential.question import Question
-from evaluators.sequential.record import stopping_note
+from evaluators.report.decision import judge_decided
+from evaluators.statistics.baselines import check_matches, read_baseline, rows_of_run, table_of_run, write_baseline
+from evaluators.statistics.gate import GateVerdict, judge_table, load_gate
+from evaluators.statistics.sequential.question import Question, stopping_note
 
 DOING = "judging a run"
 

@@ -60,7 +60,7 @@ def _scenarios() -> dict[str, str]:
 
 
 def _metrics() -> dict[str, str]:
-    from evaluators.base import resolve_plugins
     from evaluators.metrics import table_of
+    from evaluators.metrics.score import resolve_plugins
 
     return {name: facts.help for name, facts in table_of(resolve_plugins()).items()}

@@ -17,10 +17,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from evaluators.metrics import METRICS
 from evaluators.report.numbers import plural
-from evaluators.runs.choose import Choice, as_day, chosen, shown_folder
-from evaluators.runs.entry import DOING, STATES, RunEntry, State
-from evaluators.runs.find import find_runs
-from evaluators.runs.table import runs_table, variants_of
+from evaluators.report.runs import DOING, STATES, Choice, RunEntry, State, as_day, chosen, find_runs, shown_folder
+from evaluators.report.trend_tables import runs_table, variants_of
 
 EPILOG = """
 Examples:
@@ -102,9 +100,9 @@ def _trend(entries: Sequence[RunEntry], metrics: Sequence[str], places: Sequence
     Raises:
         InputError: No two of the runs are comparable.
     """
-    from evaluators.runs.steps import as_json as trend_json
-    from evaluators.runs.steps import steps_tables
-    from evaluators.runs.trend import trend
+    from evaluators.report.trend import trend
+    from evaluators.report.trend_tables import as_json as trend_json
+    from evaluators.report.trend_tables import steps_tables
 
     found = trend(entries, metrics)
     if not any(series.lines for series in found.series):
@@ -112,7 +110,7 @@ def _trend(entries: Sequence[RunEntry], metrics: Sequence[str], places: Sequence
         do_this = "keep a run folder for each commit, with the same scenes, seeds, policy and preset"
         raise InputError(DOING, f"{plural(len(entries), 'run')} below {', '.join(map(str, places))}", f"none to compare: {why}", do_this)
     if page is not None:
-        from evaluators.runs.page import write_trend  # draws charts, which takes a second to load
+        from evaluators.report.trend_page import write_trend  # draws charts, which takes a second to load
 
         write_trend(found, places, page)
     if as_json:

@@ -19,9 +19,9 @@ from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
 from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
 from evaluators import preset as find_preset
-from evaluators import presets, resolve_evaluators
+from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
-from evaluators.metrics import MetricTable
+from evaluators.metrics import MetricTable, presets
 from evaluators.report import render_table
 
 EPILOG = """

@@ -13,8 +13,8 @@ from alpasim_plugin.core.types import F64, Actor, EgoState, MetricSeries, Rollou
 from alpasim_plugin.log.schema import T_rig_box
 from alpasim_plugin.plugins.parts import build
 from evaluators import resolve_evaluators
-from evaluators.base import check_rollout, run_evaluator
-from evaluators.presets import preset as find_preset
+from evaluators.metrics.presets import preset as find_preset
+from evaluators.metrics.score import check_rollout, run_evaluator
 
 USED = ("collision", "offroad", "route")  # evaluators whose values at an instant need no more of the drive than the instant before
 DOING = "rewarding a step"

@@ -8,7 +8,7 @@ from html import escape
 from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
-from evaluators.report.frames import inline_jpeg
+from evaluators.report.flips import inline_jpeg
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, short
 from evaluators.report.tables import metric_rows

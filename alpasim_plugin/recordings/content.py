@@ -18,7 +18,7 @@ from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import Logs, no_frames
 from alpasim_plugin.viewer.pictures import Source, sources
 from evaluators.opening import Run
-from evaluators.report.events import events_of
+from evaluators.report.rollouts import events_of
 
 DOING = "exporting a rollout"
 Kind = Literal["lane border", "road edge", "crosswalk", "recorded drive"]

@@ -1,6 +1,6 @@
 """Drive scenes in random or stratified order until a question is decided, into an ordinary run folder.
 
-Scenes are driven in batches. After each, the state follows from the scenes so far and their order alone (`evaluators.sequential`), and so
+Scenes are driven in batches. After each, the state follows from the scenes so far and their order alone (`statistics.sequential`), and so
 does what is driven next: never from workers, times or interruptions. The same command therefore reaches the same decision after any kill.
 """
 
@@ -28,16 +28,22 @@ from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, kept_open
 from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
 from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, on_done, publish, write_run_info
 from alpasim_plugin.runtime.summary import pool_of
-from evaluators.aggregate.outcome import Outcome, outcome_of_failures
-from evaluators.gate.judge import failures_of
-from evaluators.gate.stored import StoredSide
-from evaluators.sequential.control import Control, adjusted_draws
-from evaluators.sequential.decision import State, outcome_of, state_after
-from evaluators.sequential.differences import SceneDifferences, scene_differences
-from evaluators.sequential.question import OPPOSITE, Order, Question
-from evaluators.sequential.record import SCHEMA_VERSION, Decision, look_as_dict, question_as_dict, write_decision
-from evaluators.sequential.seeds import next_seeds
-from evaluators.sequential.strata import Strata, families_of
+from evaluators.statistics.baselines import StoredSide
+from evaluators.statistics.gate import failures_of
+from evaluators.statistics.sequential.control import Control, adjusted_draws
+from evaluators.statistics.sequential.decision import State, look_as_dict, outcome_of, state_after
+from evaluators.statistics.sequential.differences import SceneDifferences, next_seeds, scene_differences
+from evaluators.statistics.sequential.draws import Strata, families_of
+from evaluators.statistics.sequential.question import (
+    OPPOSITE,
+    SCHEMA_VERSION,
+    Decision,
+    Order,
+    Question,
+    question_as_dict,
+    write_decision,
+)
+from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 
 KIND = "decide"  # of run.json
 DOING = "planning a decision"
@@ -56,7 +62,7 @@ class Design:
     """How scenes are drawn.
 
     Attributes:
-        order: ``random``, or ``stratified``: every batch holds the families of scenes in proportion (`evaluators.sequential.strata`).
+        order: ``random``, or ``stratified``: every batch holds the families of scenes in proportion (`sequential.draws`).
         order_seed: Key of the order.
         look_every: Scenes between looks.
         budget: Most rollouts; None: as many as the plan has.

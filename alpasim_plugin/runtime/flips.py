@@ -19,8 +19,8 @@ from alpasim_plugin.log import decode_image, encode_image, read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import LOG_NAME, PROBE_JSON, probe_folder
+from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import read_run
-from evaluators.plan_gap import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.report.flips import FLIPS_NAME, Flip, find_flips
 
 MAX_FLIPS = 60  # cells whose logs are read

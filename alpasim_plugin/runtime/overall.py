@@ -10,8 +10,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.run_folder.columns import AGAIN, DOING, RolloutTable
 from alpasim_plugin.run_folder.manifests import damaged_files, find_contents, read_run_json
 from alpasim_plugin.run_folder.schema import ROLLOUTS
-from evaluators.aggregate.overall import numbers
 from evaluators.metrics import MetricTable
+from evaluators.statistics.summary import numbers
 
 
 def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[str, Any]:

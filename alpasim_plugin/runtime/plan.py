@@ -16,7 +16,7 @@ from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.run_folder.schema import rollout_folder
 from evaluators import resolve_evaluators
-from evaluators.presets import preset
+from evaluators.metrics.presets import preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 

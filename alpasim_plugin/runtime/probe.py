@@ -34,7 +34,7 @@ from alpasim_plugin.runtime.guards import checked_frames, checked_plan
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
-from evaluators.plan_gap import DIVERGED_M, HORIZON_US, plan_gap
+from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, plan_gap
 
 HORIZONS_S = (1.0, 3.0)
 DOING = "probing renderers along a logged rollout"
@@ -62,7 +62,7 @@ class Pair:
         gap_m: Distance between the plans at `HORIZONS_S` ``(Q, 2)``; NaN where a plan ends earlier.
         turn_rad: Heading of the renderer's plan minus that of the reference's ``(Q, 2)``.
         levels: Mean absolute difference of the two images, 8-bit levels ``(Q,)``.
-        first: Row of the first divergence as in `evaluators.plan_gap`, or None.
+        first: Row of the first divergence as in `evaluators.metrics.plan`, or None.
         first_gap_m: The gap there, at the horizon or the end of the shorter plan.
     """
 

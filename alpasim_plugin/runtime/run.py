@@ -38,8 +38,8 @@ from alpasim_plugin.runtime.provenance import chosen, hardware, project, version
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.stores.commits import opened
 from alpasim_plugin.runtime.summary import pool_of, write_summary
-from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import MetricTable, table_of
+from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1

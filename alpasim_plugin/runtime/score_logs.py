@@ -24,7 +24,7 @@ from alpasim_plugin.runtime.loop_state import PathEnd
 from alpasim_plugin.runtime.scoring import contacts_of, tabulate
 from evaluators import reduce_rollout, score
 from evaluators.alpasim import ScoredRollout
-from evaluators.presets import Preset
+from evaluators.metrics.presets import Preset
 
 DOING = "scoring logs"
 UNKNOWN = "unknown"  # renderer or policy that a log does not name

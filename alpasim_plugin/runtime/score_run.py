@@ -25,7 +25,6 @@ from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run, origin_of
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
 from alpasim_plugin.runtime.summary import pool_of
-from evaluators.aggregate.reduce import RolloutValue
 from evaluators.alpasim import (
     EvalSettings,
     SceneScore,
@@ -38,7 +37,8 @@ from evaluators.alpasim import (
     scene_score,
 )
 from evaluators.metrics import METRICS, MetricTable, table_of
-from evaluators.presets import Preset
+from evaluators.metrics.presets import Preset
+from evaluators.statistics.reduce import RolloutValue
 
 
 @dataclass(frozen=True)

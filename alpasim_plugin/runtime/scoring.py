@@ -15,7 +15,7 @@ from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.plugins.parts import PartSpec
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
-from evaluators.route import lateral_bias
+from evaluators.metrics.route import lateral_bias
 
 # Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
 FIXER_FACTS = ("pose_error_m", "forecast_error_m")

@@ -11,9 +11,10 @@ from alpasim_plugin.plugins.parts import names
 from alpasim_plugin.run_folder.sides import Row
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import Progress, execute_run
-from evaluators.aggregate.outcome import Outcome, outcome_of_failures, worst
-from evaluators.gate import GateSpec, GateVerdict, judge, rows_of_run
 from evaluators.opening import read_run
+from evaluators.statistics.baselines import rows_of_run
+from evaluators.statistics.gate import GateSpec, GateVerdict, judge
+from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
 from scenarios.suite import load_suite
 
 SUITE = "suites/gate_self_test"

@@ -18,8 +18,8 @@ from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.provenance import fixers
 from alpasim_plugin.runtime.recorder import plan_table
 from evaluators import censoring
-from evaluators.aggregate.overall import NO_BASES, by_policy, numbers
 from evaluators.metrics import METRICS, MetricTable
+from evaluators.statistics.summary import NO_BASES, by_policy, numbers
 
 
 def write_summary(

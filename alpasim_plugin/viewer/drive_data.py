@@ -16,7 +16,7 @@ from alpasim_plugin.log import read_facts
 from alpasim_plugin.run_folder.rows import Rollout, series_by_cell
 from alpasim_plugin.viewer.units import Place, mrad, rounded
 from evaluators.opening import Run
-from evaluators.report.events import SERIES, Event, events_of
+from evaluators.report.rollouts import SERIES, Event, events_of
 
 PLAN_STEP_US = 500_000
 MAX_SAMPLES = 8  # of a plan; the first ones

@@ -18,8 +18,8 @@ from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
 from alpasim_plugin.viewer.units import Place
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
-from evaluators.report.events import clock_zero_us
 from evaluators.report.flips import FLIPS_NAME, baseline_of
+from evaluators.report.rollouts import clock_zero_us
 
 DOING = "reading a rollout to watch"
 LOG = "rollout.asl"

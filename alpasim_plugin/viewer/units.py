@@ -20,7 +20,7 @@ class Place:
 
     Attributes:
         origin: ``(2,)`` metres, world: the first point of the recorded drive.
-        zero_us: The first camera frame (`evaluators.report.events.clock_zero_us`), on the scene's clock.
+        zero_us: The first camera frame (`evaluators.report.rollouts.clock_zero_us`), on the scene's clock.
     """
 
     origin: F64

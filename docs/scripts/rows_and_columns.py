@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.processes import resident_mb
-from evaluators.aggregate.paired import paired
-from evaluators.gate import GateVerdict, judge, judge_table, load_gate, rows_of_run, table_of_run
-from evaluators.gate.across import compare_within
 from evaluators.opening import read_run
+from evaluators.statistics.across import compare_within
+from evaluators.statistics.baselines import rows_of_run, table_of_run
+from evaluators.statistics.gate import GateVerdict, judge, judge_table, load_gate
+from evaluators.statistics.paired import paired
 
 
 def gate_by_rows(folder: Path) -> GateVerdict:

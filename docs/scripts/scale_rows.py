@@ -25,8 +25,8 @@ from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.manifests import write_contents, write_run_json
 from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE, SUMMARY, rollout_folder
 from alpasim_plugin.run_folder.writer import write_parquet
-from evaluators.aggregate.overall import numbers
 from evaluators.metrics import METRICS as KNOWN
+from evaluators.statistics.summary import numbers
 
 RENDERERS, POLICY = ("clean", "3dgs"), "lane-camera"
 CORRELATION, FAILED, CROWDED = 0.3, 0.005, 0.7  # of hardness within a scene; shares of rollouts, and of scenes with road users

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.io.config import load_yaml, validate
-from evaluators.presets import ALPASIM, Preset
+from evaluators.metrics.presets import ALPASIM, Preset
 
 DOING = "reading evaluation settings"
 

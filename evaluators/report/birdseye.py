@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.rows import Rollout, Series
-from evaluators.report.events import Event, clock_zero_us, events_of
 from evaluators.report.numbers import fixed
+from evaluators.report.rollouts import Event, clock_zero_us, events_of
 
-F64 = npt.NDArray[np.float64]
 Variants = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
@@ -168,7 +167,13 @@ def scene_view(
     log = np.stack([np.asarray(content["ego_log"][k], float) for k in ("x_m", "y_m")], 1)
     if len(log) < 2:
         return None
-    driven = {r.cell: xy for r in rollouts if (xy := _driven(series.get(r.cell, {}))) is not None}
+    driven: dict[tuple[str, str, str, int], F64] = {}
+    for r in rollouts:
+        own = series.get(r.cell, {})
+        if "ego_x_m" in own and "ego_y_m" in own:
+            (tx, x), (ty, y) = own["ego_x_m"], own["ego_y_m"]
+            if len(x) > 1 and np.array_equal(tx, ty):
+                driven[r.cell] = np.stack([x, y], 1)
     frame = _Frame(log, list(driven.values()))
     names_policy = len({r.policy for r in rollouts}) > 1
 
@@ -181,11 +186,17 @@ def scene_view(
         if r.cell in driven and (r.renderer, r.policy) in variant_of
     ]
     vehicle = content.get("vehicle") or {}
-    zero_us = clock_zero_us(content, _first_us(rollouts, series))
-    marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout), zero_us) for r in rollouts for e in events_of(r, series)]
+    logged = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
+    zero_us = clock_zero_us(content, min((int(t_us[0]) for t_us in logged), default=0))
     bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
     lanes = content.get("lanes") or []
-    at_us, at_text = _moment(rollouts, series, zero_us)
+    events = [event for rollout in rollouts for event in events_of(rollout, series)]
+    at_us, at_text = _moment(logged, events, zero_us)
+
+    def draw(xy: F64, closed: bool) -> str:
+        units = frame.units(xy)
+        return path_data(units, closed, tolerance=0.0 if closed else 1.5) if frame.sees(units) else ""
+
     return SceneView(
         scene=scene,
         source=str(content.get("source") or ""),
@@ -198,44 +209,32 @@ def scene_view(
         crosswalks=_areas(content.get("crosswalks") or [], frame),
         log=path_data(frame.units(log)),
         tracks=tuple(tracks),
-        marks=tuple(marks),
+        marks=tuple(_mark(event, frame, vehicle, variant_of, label(event.rollout), zero_us) for event in events),
         bar_units=round(bar_m * frame.scale),
         bar_label=f"{bar_m:.0f}\u00a0m",
         north_deg=round(frame.north_deg, 1),
         offset=_offset_chart(rollouts, series, variant_of, label),
-        road_users=tuple(road_users(content, at_us, log, lambda xy, closed: _seen(xy, closed, frame))),
+        road_users=tuple(road_users(content, at_us, log, draw)),
         road_users_at=at_text,
     )
 
 
-def _first_us(rollouts: Sequence[Rollout], series: Series) -> int:
-    """Return the time of the first logged pose; 0 where none is logged."""
-    return min((int(series[r.cell]["ego_x_m"][0][0]) for r in rollouts if "ego_x_m" in series.get(r.cell, {})), default=0)
+def _moment(logged: Sequence[I64], events: Sequence[Event], zero_us: int) -> tuple[int, str]:
+    """Return when road users are drawn: at the scene's first event, else half way through.
 
-
-def _moment(rollouts: Sequence[Rollout], series: Series, zero_us: int) -> tuple[int, str]:
-    """Return when road users are drawn: at the scene's first event, else half way through."""
-    times = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
-    if not times:
+    Args:
+        logged: Times of each rollout's poses.
+        events: Of all rollouts.
+        zero_us: The instant that the scene's times count from.
+    """
+    firsts = [(event.t_us, event.what) for event in events if event.t_us is not None]
+    if not logged:
         return 0, ""
-    firsts = [(e.t_us, e.what) for r in rollouts for e in events_of(r, series) if e.t_us is not None]
     if firsts:
         t_us, what = min(firsts)
         return t_us, f"at {fixed((t_us - zero_us) * 1e-6, 1)}\u00a0s, when the first {what} happens"
-    middle_us = (min(int(t[0]) for t in times) + max(int(t[-1]) for t in times)) // 2
+    middle_us = (min(int(t[0]) for t in logged) + max(int(t[-1]) for t in logged)) // 2
     return middle_us, f"at {fixed((middle_us - zero_us) * 1e-6, 1)}\u00a0s, half way"
-
-
-def _seen(xy: F64, closed: bool, frame: _Frame) -> str:
-    units = frame.units(xy)
-    return path_data(units, closed, tolerance=0.0 if closed else 1.5) if frame.sees(units) else ""
-
-
-def _driven(own: Mapping[str, tuple[Any, F64]]) -> F64 | None:
-    if "ego_x_m" not in own or "ego_y_m" not in own:
-        return None
-    (tx, x), (ty, y) = own["ego_x_m"], own["ego_y_m"]
-    return np.stack([x, y], 1) if len(x) > 1 and np.array_equal(tx, ty) else None
 
 
 def lane_ring(lane: Mapping[str, Any]) -> list[list[float]]:
@@ -337,14 +336,14 @@ def road_users(content: Mapping[str, Any], at_us: int, log: F64, draw: Callable[
         draw: From ``(N, 2)`` world metres and whether the line is closed to SVG path data; empty where nothing of it is in the picture.
     """
     known = [actor for actor in content.get("actors") or [] if actor.get("x_m") and actor.get("length_m")]
-    nearest = sorted(known, key=lambda actor: _distance(actor, log))[:MAX_ACTORS]
+
+    def distance(actor: Mapping[str, Any]) -> float:
+        xy = np.column_stack([actor["x_m"], actor["y_m"]])
+        return float(np.min(np.hypot(*(xy[:, None] - log[None, ::10]).transpose(2, 0, 1))))
+
+    nearest = sorted(known, key=distance)[:MAX_ACTORS]
     found = (_road_user(actor, at_us, draw) for actor in nearest)
     return [one for one in found if one.body or one.way]
-
-
-def _distance(actor: Mapping[str, Any], log: F64) -> float:
-    xy = np.column_stack([actor["x_m"], actor["y_m"]])
-    return float(np.min(np.hypot(*(xy[:, None] - log[None, ::10]).transpose(2, 0, 1))))
 
 
 def _road_user(actor: Mapping[str, Any], at_us: int, draw: Callable[[F64, bool], str]) -> RoadUser:

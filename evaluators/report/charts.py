@@ -11,19 +11,19 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-import numpy.typing as npt
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.run_folder.rows import Rollout, Series
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
-from evaluators.report.events import events_of
 from evaluators.report.numbers import LEAST_SPAN, finite, interval
+from evaluators.report.rollouts import events_of
 
 N_COLOURS = 8
 SIZE_IN = (4.6, 2.7)  # about 440 x 260 CSS pixels: legible at its own size on a phone
@@ -76,10 +76,10 @@ class Curve:
     label: str
     colour: int
     dash: int
-    x: npt.NDArray[np.float64]
-    y: npt.NDArray[np.float64]
-    low: npt.NDArray[np.float64] | None = None
-    high: npt.NDArray[np.float64] | None = None
+    x: F64
+    y: F64
+    low: F64 | None = None
+    high: F64 | None = None
 
 
 def new_axes(
@@ -147,7 +147,7 @@ def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[t
         return []
     several = len({policy for _, policy in by_variant}) > 1
 
-    def curves(make: Callable[[list[Rollout]], tuple[npt.NDArray[np.float64], ...]]) -> list[Curve]:
+    def curves(make: Callable[[list[Rollout]], tuple[F64, ...]]) -> list[Curve]:
         names = {key: " \u00b7 ".join(key) if several else key[0] for key in by_variant}
         return [Curve(names[key], *variant_of[key], *make(members)) for key, members in by_variant.items()]
 
@@ -168,7 +168,7 @@ def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[t
     return charts
 
 
-def _offset_band(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np.float64], ...]:
+def _offset_band(members: list[Rollout], series: Series) -> tuple[F64, ...]:
     own = [series[r.cell]["lateral_bias_m"] for r in members]
     end_s = max(float(t[-1] - t[0]) for t, _ in own) * 1e-6
     grid = np.linspace(0.0, end_s, N_BINS)
@@ -182,7 +182,7 @@ def _offset_band(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np
     return grid[enough], middle, low, high
 
 
-def _survival(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np.float64], ...]:
+def _survival(members: list[Rollout], series: Series) -> tuple[F64, ...]:
     ends = [series[r.cell]["lateral_bias_m"][0] for r in members]
     end_s = max(float(t[-1] - t[0]) for t in ends) * 1e-6
     firsts = [min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=np.inf) for r in members]
@@ -337,7 +337,12 @@ def _name(axes: Axes, points: Sequence[_Point]) -> None:
         steps = sorted((5.0 + LINE_PT * k for k in range(-12, 13)), key=lambda dy: abs(dy - 5.0))
         boxes = ((x + dx, x + dx + width, y + dy, y + dy + LINE_PT) for dy in steps)
         bottom, top = axes.bbox.y0 / point_px, axes.bbox.y1 / point_px
-        box = next((b for b in boxes if b[2] >= bottom and b[3] <= top and not any(_overlap(b, t) for t in taken)), None)
+        box = None
+        for b in boxes:
+            covers = any(b[0] < t[1] and t[0] < b[1] and b[2] < t[3] and t[2] < b[3] for t in taken)
+            if b[2] >= bottom and b[3] <= top and not covers:
+                box = b
+                break
         box = box or (x + dx, x + dx + width, y + 5.0, y + 5.0 + LINE_PT)
         taken.append(box)
         colour = VARIANT[point.line.variant % N_COLOURS]
@@ -351,10 +356,6 @@ def _no_magnifying(get: Callable[[], tuple[float, float]], put: Callable[[float,
     lacking = LEAST_SPAN.get(unit, 0.0) - (high - low)
     if lacking > 0.0:
         put(low - lacking / 2, high + lacking / 2)
-
-
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[1] and b[0] < a[1] and a[2] < b[3] and b[2] < a[3]
 
 
 def _time_axis(axes: Axes, ms: Sequence[float]) -> None:

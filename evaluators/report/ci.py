@@ -13,14 +13,13 @@ from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Rollout
-from evaluators.gate.judge import Check, GateVerdict
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
-from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell, plural
-from evaluators.report.provenance import provenance
+from evaluators.report.provenance import LEDGER_COLUMNS, failure_rows, ledger, provenance
+from evaluators.statistics.gate import Check, GateVerdict
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
 CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
@@ -75,12 +74,19 @@ def summary_md(run: Run) -> str:
     removed = ledger(run, LEDGER_RATES)
     if removed:
         head = ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES]
-        body = [[r.renderer, *(_tally(c) for c in r.counts), *(c.text for c in r.bounds)] for r in removed]
+        body = []
+        for r in removed:
+            counts = [f"{c.text} ({c.note})" if c.note and c.text != "0" else c.text for c in r.counts]
+            body.append([r.renderer, *counts, *(c.text for c in r.bounds)])
         parts.append(f"\n### Not in the numbers\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
     failures, more = failure_rows(run)
     if failures:
         head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
-        body = [[*_key(f.rollout), "; ".join(f"{label}: {text}" for label, text in f.parts)] for f in failures]
+        body = []
+        for failure in failures:
+            r = failure.rollout
+            what = "; ".join(f"{label}: {text}" for label, text in failure.parts)
+            body.append([r.failure_class, r.renderer, r.policy, r.scene, str(r.seed), what])
         parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
     command = provenance(run).command
     parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")
@@ -100,14 +106,6 @@ def cut(text: str, limit: int = MAX_BYTES) -> str:
         return text
     kept = data[: limit - len(CUT_NOTE.encode())]
     return kept[: kept.rfind(b"\n") + 1].decode() + CUT_NOTE
-
-
-def _tally(cell: Cell) -> str:
-    return f"{cell.text} ({cell.note})" if cell.note and cell.text != "0" else cell.text
-
-
-def _key(rollout: Rollout) -> list[str]:
-    return [rollout.failure_class, rollout.renderer, rollout.policy, rollout.scene, str(rollout.seed)]
 
 
 def metric_label(name: str, unit: str, arrow: str) -> str:
@@ -151,7 +149,9 @@ def junit(run: Run) -> ET.Element:
         "time": f"{sum(r.wall_s or 0.0 for r in run.rollouts):.3f}",
     }
     root = ET.Element("testsuites", {"name": "simrun", **counts})
-    suite = ET.SubElement(root, "testsuite", {"name": clean(_suite_name(run)), **counts})
+    asked = run.info.get("asked") or []
+    name = str(asked[0]) if len(asked) == 1 else run.folder.resolve().name  # what the command named, where that was one thing
+    suite = ET.SubElement(root, "testsuite", {"name": clean(name), **counts})
     if run.info.get("started_at"):
         suite.set("timestamp", clean(str(run.info["started_at"])))
     facts = {
@@ -165,12 +165,6 @@ def junit(run: Run) -> ET.Element:
     for rollout in run.rollouts:
         _case(suite, rollout, with_values)
     return root
-
-
-def _suite_name(run: Run) -> str:
-    """Return the suite or scenario that the command named, where it was one; a list of them has the name of the run's folder."""
-    asked = run.info.get("asked") or []
-    return str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
 
 
 def _case(suite: ET.Element, rollout: Rollout, with_values: bool) -> None:

@@ -1,19 +1,21 @@
-"""Presentation of a decision: the last lines on a terminal, the section of the report and its picture."""
+"""A decision: the last lines on a terminal, the section of the report with its picture, and the gate's verdict on a run decided so."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from evaluators.aggregate.outcome import WORDS
+from alpasim_plugin.run_folder.sides import Row
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.opening import Run
 from evaluators.report.numbers import decimals, fixed
-from evaluators.report.terminal import LABEL
-from evaluators.sequential.record import Decision, read_decision
+from evaluators.report.terminal import LABEL, labelled
+from evaluators.statistics.gate import Check, GateSpec, GateVerdict, judge
+from evaluators.statistics.sequential.question import Decision, read_decision
+from evaluators.statistics.verdicts import WORDS, Cause, Outcome, outcome_of_failures, worst
 
 WORST_CASE = "any bound"
 
@@ -42,17 +44,17 @@ def verdict_line(decision: Decision) -> str:
     verdict = decision["verdict"] if cause in ("pass", "regression", "undecided") else WORDS[cause].lower()
     text = f"{decision['candidate']} against {decision['baseline']}: {verdict}, {after}"
     why = "" if decision["stopped"] == "decided" else f" ({decision['stopped']})"
-    return _line("verdict", text + why)
+    return labelled("verdict", text + why)
 
 
-def metric_lines(decision: Decision, known: MetricTable = METRICS) -> list[str]:
+def metric_lines(decision: Decision) -> list[str]:
     """Return one line a metric, and one for the guarantee."""
     lines = []
-    for row in metric_rows(decision, known):
+    for row in metric_rows(decision):
         note = "" if row.binding else ", not binding"
         text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
-        lines.append(_line("", text))
-    return [*lines, *(_line("sure" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
+        lines.append(labelled("", text))
+    return [*lines, *(labelled("sure" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
 
 
 def guarantee(decision: Decision) -> list[str]:
@@ -134,7 +136,8 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     looks = decision["looks"]
     scale, unit, _ = _print_as(metric, [])
     n = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
-    diff, low, high = (scale * _series([_at(look["metrics"][name], k) for look in looks]) for k in range(3))
+    seen = [look["metrics"][name] for look in looks]
+    diff, low, high = scale * np.array([[one["diff"], *one["interval"]] for one in seen], dtype=np.float64).T  # None becomes NaN
     sign = -1.0 if metric.direction == "higher" else 1.0
     threshold = scale * sign * one["threshold"]
     limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
@@ -145,7 +148,9 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
         for limit in limits:
             axes.axhline(limit, color=INK, linewidth=1.0, linestyle=(0, (5.0, 2.0)))
-        known = np.concatenate([diff[np.isfinite(diff)], limits, [0.0], *_late(low, high)])
+        late = len(looks) // 2  # the bounds of the first looks would make the rest flat
+        known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
+        known = known[np.isfinite(known)]
         room = 0.15 * max(float(np.ptp(known)), 1e-9)
         axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
         axes.set_xlim(0.0, float(n[-1]) * 1.02)
@@ -156,21 +161,6 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     return Chart(name, "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.", svg)
 
 
-def _late(low: Any, high: Any) -> list[Any]:
-    """Return the bounds of the later half of the looks: the first ones would make the rest flat."""
-    half = len(low) // 2
-    return [ends[half:][np.isfinite(ends[half:])] for ends in (low, high)]
-
-
-def _at(look: Any, k: int) -> float | None:
-    value: float | None = look["diff"] if k == 0 else look["interval"][k - 1]
-    return value
-
-
-def _series(values: Sequence[float | None]) -> Any:
-    return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-
-
 def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float, str, int]:
     """Return scale, unit and decimals in which a metric's differences are printed."""
     unit = metric.unit
@@ -179,5 +169,43 @@ def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float
     return 1.0, f" {unit}" if unit else "", decimals(*values)
 
 
-def _line(label: str, text: str) -> str:
-    return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")
+CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
+
+
+def judge_decided(
+    rows: Sequence[Row], spec: GateSpec, decision: Decision, stored: Sequence[Row] | None = None, known: MetricTable = METRICS
+) -> GateVerdict:
+    """Judge rollout rows whose number was decided while they were driven.
+
+    The intervals of `judge` are those of a fixed number of scenes, so its margins are replaced by the decision's verdicts; limits and
+    failures stay.
+
+    Args:
+        rows: Every rollout that was driven.
+        spec: The gate whose margins were asked about.
+        decision: What was decided.
+        stored: Rows of a stored baseline, of the scenes and seeds that were driven; without it the baseline was driven, too.
+        known: What the metrics are.
+    """
+    plain = judge(rows, spec, stored, decision["baseline"], known)
+    found = {row.metric: row for row in metric_rows(decision, known)}
+    checks = tuple(_decided(check, found[check.metric], spec, decision) if check.kind == "margin" else check for check in plain.checks)
+    outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
+    return replace(plain, outcome=worst([outcome_of_failures(plain.failures, spec.max_failed), *outcomes]), checks=checks)
+
+
+def _decided(check: Check, row: MetricRow, spec: GateSpec, decision: Decision) -> Check:
+    look = decision["looks"][-1]["metrics"][check.metric]
+    cause = CAUSES[look["verdict"]]
+    text = f"{check.renderer}: {check.metric} {row.diff} against {decision['baseline']} ({row.interval} at every look, margin {row.margin})"
+    text = f"{text}: {look['verdict']} after {row.n_scenes} scenes".replace("\u00a0", " ")
+    entry = check.entry
+    planned = entry["n_cells"] + entry["n_missing"]
+    if cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
+        cause = "undecided"
+        text += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
+    elif cause == "undecided" and check.binding:
+        text += f"; {decision['stopped']}"
+    kept = {key: value for key, value in entry.items() if key not in ("ci95", "p_value", "test", "more_scenes", "method", "difference")}
+    told = {"interval": look["interval"], "verdict": look["verdict"], "method": decision["question"]["metrics"][check.metric]["method"]}
+    return replace(check, cause=cause, text=text, entry=kept | told)

@@ -36,10 +36,8 @@ class FixerRow:
 
 def fixer_rows(summary: Mapping[str, Any]) -> list[FixerRow]:
     """Lay out the fixers of a run; empty where there are none."""
-    return [
-        FixerRow(name, bool(entry.get("trained")), _cells(entry, refused(summary, name)))
-        for name, entry in (summary.get("fixers") or {}).items()
-    ]
+    fixers = summary.get("fixers") or {}
+    return [FixerRow(name, bool(entry.get("trained")), _cells(entry, refused(summary, name))) for name, entry in fixers.items()]
 
 
 def fixer_lines(summary: Mapping[str, Any]) -> list[str]:
@@ -133,51 +131,41 @@ def speed(run: Run) -> Speed:
     rows = []
     for renderer, entry in entries.items():
         stages = entry.get("stages") or {}
+        means = [_per_frame(stages.get(name) or {}) for name in names]
         bar = [
             Segment(i, name, short(ms, "ms"), round(100.0 * ms / longest, 2))
-            for i, name in enumerate(names)
-            if longest and (ms := _per_frame(stages.get(name) or {}))
+            for i, (name, ms) in enumerate(zip(names, means, strict=True))
+            if longest and ms
         ]
-        rows.append(
-            SpeedRow(
-                renderer,
-                index.get(renderer, 0),
-                tuple(_ms(entry.get(key)) for key in ("ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms")),
-                tuple(_stage(stages.get(name)) for name in names),
-                tuple(bar),
-                short(sums[renderer] or None, "ms"),
-            )
-        )
-    return Speed(tuple(rows), tuple(names), _pool(run.summary.get("pool") or {}))
+        cells = []
+        for key in ("ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms"):
+            number = finite(entry.get(key))
+            absent = missing("no finished rollout has a frame after its first")
+            cells.append(absent if number is None else Cell(short(number), sort=number))
+        of_stages = tuple(_stage(stages.get(name) or {}) for name in names)
+        total = short(sums[renderer] or None, "ms")
+        rows.append(SpeedRow(renderer, index.get(renderer, 0), tuple(cells), of_stages, tuple(bar), total))
+    pool = run.summary.get("pool") or {}
+    said = []
+    if pool.get("workers"):
+        threads = plural(int(pool.get("threads_per_worker") or 1), "thread")
+        said.append(f"{plural(int(pool['workers']), 'worker')} with {threads} each")
+    frames, wall = finite(pool.get("frames_per_s_total")), finite(pool.get("wall_s"))
+    said += [f"{short(frames)} camera frames/s in total"] if frames is not None else []
+    said += [f"{duration(wall)} of wall time"] if wall is not None else []
+    return Speed(tuple(rows), tuple(names), ", ".join(said))
+
+
+def _stage(entry: Mapping[str, Any]) -> Cell:
+    p50, p95, share = (finite(entry.get(key)) for key in ("p50_ms", "p95_ms", "share"))
+    if p50 is None:
+        return missing("this renderer has no such stage")
+    said = [f"p95 {short(p95)}"] if p95 is not None else []
+    said += [f"{fixed(100 * share, 0)}\u00a0%"] if share is not None else []
+    return Cell(short(p50), "median; 95th percentile; share of the loop's time", " \u00b7 ".join(said), sort=p50)
 
 
 def _per_frame(stage: Mapping[str, Any]) -> float | None:
     """Return what a stage costs per frame: its mean where it is stated, since some stages run once for several frames."""
     mean = finite(stage.get("per_frame_ms"))
     return finite(stage.get("p50_ms")) if mean is None else mean
-
-
-def _ms(value: Any) -> Cell:
-    number = finite(value)
-    return missing("no finished rollout has a frame after its first") if number is None else Cell(short(number), sort=number)
-
-
-def _stage(entry: Mapping[str, Any] | None) -> Cell:
-    p50 = finite((entry or {}).get("p50_ms"))
-    if entry is None or p50 is None:
-        return missing("this renderer has no such stage")
-    p95, share = finite(entry.get("p95_ms")), finite(entry.get("share"))
-    detail = " \u00b7 ".join(
-        ([f"p95 {short(p95)}"] if p95 is not None else []) + ([f"{fixed(100 * share, 0)}\u00a0%"] if share is not None else [])
-    )
-    return Cell(short(p50), "median; 95th percentile; share of the loop's time", detail, sort=p50)
-
-
-def _pool(pool: Mapping[str, Any]) -> str:
-    said = []
-    if pool.get("workers"):
-        said.append(f"{plural(int(pool['workers']), 'worker')} with {plural(int(pool.get('threads_per_worker') or 1), 'thread')} each")
-    total, wall = finite(pool.get("frames_per_s_total")), finite(pool.get("wall_s"))
-    said += [f"{short(total)} camera frames/s in total"] if total is not None else []
-    said += [f"{duration(wall)} of wall time"] if wall is not None else []
-    return ", ".join(said)

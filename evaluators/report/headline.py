@@ -118,10 +118,6 @@ def _listing(run: Run, metrics: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
-def _baseline(pairs: Mapping[str, Any]) -> str:
-    return str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
-
-
 def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     stats = run.summary.get("metrics", {}).get(variant, {})
     lead = [m for m in run.table.headline if m in pairs and finite(pairs[m].get("diff")) is not None]
@@ -139,27 +135,18 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     parts = [_difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
     parts += [f"no difference at all in {_listing(run, same)}"] if same else []
     text = "; ".join(parts)
+    text = text or "no metric is valid in both members of any pair"
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    return Point(
-        variant,
-        tone,
-        text or "no metric is valid in both members of any pair",
-        worse,
-        better,
-        _baseline(pairs),
-        _lead(run, variant, pairs, lead),
-    )
+    baseline = str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
 
+    def against_margin(m: str) -> float:
+        return abs(float(pairs[m]["diff"])) / max(finite(pairs[m].get("margin")) or 0.0, 1e-3)
 
-def _lead(run: Run, variant: str, pairs: Mapping[str, Any], metrics: Sequence[str]) -> str:
-    """Print the first difference that is shown; where none is, the one that is largest against its margin."""
-    shown = [m for m in metrics if pairs[m].get("difference") in ("better", "worse")]
-
-    def size(metric: str) -> float:
-        return abs(float(pairs[metric]["diff"])) / max(finite(pairs[metric].get("margin")) or 0.0, 1e-3)
-
-    chosen = next(iter(shown), max(metrics, key=size, default=None))
-    return "" if chosen is None else _difference(run, variant, chosen, pairs[chosen], brief=False)
+    # The first difference that is shown says most; where none is, the one that is largest against its margin.
+    shown = [m for m in lead if pairs[m].get("difference") in ("better", "worse")]
+    most = next(iter(shown), max(lead, key=against_margin, default=None))
+    first = "" if most is None else _difference(run, variant, most, pairs[most], brief=False)
+    return Point(variant, tone, text, worse, better, baseline, first)
 
 
 def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:

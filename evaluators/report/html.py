@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -23,15 +23,12 @@ from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import section
-from evaluators.report.events import COLLISION, read_series
-from evaluators.report.every_rollout import rollout_block
-from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.flips import baseline_of, flip_rows
-from evaluators.report.frames import comparisons
+from evaluators.report.flips import baseline_of, comparisons, flip_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
-from evaluators.report.provenance import certificate, provenance
+from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
+from evaluators.report.rollouts import COLLISION, read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 
@@ -69,13 +66,7 @@ def write_report(run_dir: Path | str, replays: Mapping[tuple[str, str, str, int]
 
 def render_report(run: Run, replays: Mapping[tuple[str, str, str, int], str] = NO_REPLAYS) -> str:
     """Render the report as a string; ``replays`` as in `write_report`."""
-    environment = _environment()
-    assets = {"css": ("theme", "report"), "js": ("theme", "report", "rollouts")}
-    style, script = ("\n".join(asset(environment, f"{name}.{kind}") for name in names) for kind, names in assets.items())
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return environment.get_template("report.html.j2").render(
-        style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, replays=replays, **context(run)
-    )
+    return render_page("report.html.j2", ("theme", "report"), ("theme", "report", "rollouts"), dash=DASH, replays=replays, **context(run))
 
 
 @cache
@@ -83,6 +74,16 @@ def _environment() -> Environment:
     """Return the templates; a process compiles each of them once."""
     loader = PackageLoader("evaluators.report")
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+def render_page(template: str, styles: Sequence[str], scripts: Sequence[str], **values: Any) -> str:
+    """Render a template with style sheets and scripts inside the page; the hash allows the page to run this script and no other."""
+    environment = _environment()
+    style = "\n".join(asset(environment, f"{name}.css") for name in styles)
+    script = "\n".join(asset(environment, f"{name}.js") for name in scripts)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    page = {"style": Markup(style), "script": Markup(script), "script_hash": digest, "plural": plural}
+    return environment.get_template(template).render(page | values)
 
 
 def context(run: Run) -> dict[str, Any]:
@@ -99,7 +100,11 @@ def context(run: Run) -> dict[str, Any]:
     by_scene, more_scene_rows = scene_rows(run, interesting)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
-    colours = _variant_colours(run)
+    place = {name: i for i, name in enumerate(run.renderers)}
+    colours = {}  # every column has its renderer's colour
+    for i, variant in enumerate(run.variants):
+        renderer = next((r.renderer for r in run.rollouts_of(variant)), variant)
+        colours[variant] = place.get(renderer, i)
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
     split = strata(run, sample)
     of_sample = "" if sample is None else f"From {plural(len(sample), 'scene')} of {len(run.scenes)}, evenly chosen from their list."
@@ -209,12 +214,6 @@ def _when(text: Any) -> str:
         return datetime.fromisoformat(str(text)).strftime("%Y-%m-%d %H:%M %Z").strip()
     except ValueError:
         return str(text or "")
-
-
-def _variant_colours(run: Run) -> dict[str, int]:
-    """Give every column its renderer's colour."""
-    index = {name: i for i, name in enumerate(run.renderers)}
-    return {variant: index.get(next((r.renderer for r in run.rollouts_of(variant)), variant), i) for i, variant in enumerate(run.variants)}
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:

@@ -77,11 +77,11 @@ def fixed(value: float, places: int, sign: bool = False) -> str:
     return ("+" if sign and not is_zero else "") + text
 
 
-def short(value: float | None, unit: str = "", digits: int = 3) -> str:
+def short(value: float | None, unit: str = "") -> str:
     """Print a lone number with a unit; a dash where missing."""
     if value is None:
         return DASH
-    return fixed(value, decimals(value, digits=digits)) + (f"\u00a0{unit}" if unit else "")
+    return fixed(value, decimals(value)) + (f"\u00a0{unit}" if unit else "")
 
 
 def count_of(mean: float, n: int) -> str:

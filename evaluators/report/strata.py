@@ -8,15 +8,15 @@ from itertools import pairwise
 
 import matplotlib as mpl
 import numpy as np
-import numpy.typing as npt
 
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
-from evaluators.aggregate.intervals import clustered
 from evaluators.metrics import METRICS
 from evaluators.opening import Run
 from evaluators.report.charts import GRID, MARKERS, N_COLOURS, RC, VARIANT, Chart, new_axes, themed_svg
-from evaluators.report.events import COLLISION
 from evaluators.report.numbers import Cell, fixed, missing, plural, short
+from evaluators.report.rollouts import COLLISION
+from evaluators.statistics.intervals import clustered
 
 DISTANCE, OPACITY = "lateral_bias_m", "opacity_mean"
 DISTANCE_EDGES_M = (0.25, 0.5, 1.0, 2.0)
@@ -27,9 +27,6 @@ SERIES = (DISTANCE, OPACITY, *VALUES, *COLLISION, "offroad", "eval_relevant")
 NOT_BESIDE = "not beside the path"
 LEAST_STEPS = 10  # fewer steps in a stratum give no mean
 LEAST_SCENES = 3  # fewer scenes give no interval
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -99,11 +96,12 @@ def strata(run: Run, scenes: Sequence[str] | None = None) -> list[Strata]:
         found.append(_split("By distance from the logged path", note, "distance from the path", "m", labels, steps, groups, run))
     covered = [one for one in steps if one.opacity is not None]
     if covered:
-        every = np.concatenate([one.opacity[np.isfinite(one.opacity)] for one in covered if one.opacity is not None])
+        seen = [np.asarray(one.opacity) for one in covered]
+        every = np.concatenate([values[np.isfinite(values)] for values in seen])
         quartiles = np.floor(np.percentile(every, OPACITY_SHARES) * 1000) / 1000 if every.size else ()  # down: 0.9996 is not 1
         edges = tuple(dict.fromkeys(float(v) for v in quartiles))
         note = "Opacity: mean over the picture of what the Gaussians cover; little means sky, or holes. Limits are quartiles of this run."
-        groups = [one.opacity_bin(edges) for one in covered]
+        groups = [np.where(np.isfinite(values), np.digitize(values, edges), -1) for values in seen]
         found.append(_split("By rendered opacity", note, "rendered opacity", "", _labels(edges, ""), covered, groups, run))
     return found
 
@@ -113,7 +111,11 @@ def stratum_rows(one: Strata) -> list[StratumRow]:
     rows = []
     for order, stratum in enumerate(one.strata):
         for b in stratum.bins:
-            counts = [Cell(str(b.events[name]), _rate(b.events[name], b.seconds), sort=b.events[name]) for name, _ in EVENTS]
+            counts = []
+            for name, _ in EVENTS:
+                n = b.events[name]
+                rate = f"{short(100 * n / b.seconds)} per 100 s driven" if b.seconds > 0 else ""
+                counts.append(Cell(str(n), rate, sort=n))
             values = [_mean(b, name) for name in VALUES]
             time = Cell(f"{fixed(b.seconds, 1)}\u00a0s", plural(b.rollouts, "rollout"), sort=b.seconds)
             rows.append(StratumRow(stratum.label, order, b.renderer, b.variant, (time, *counts, *values)))
@@ -160,10 +162,6 @@ class _Steps:
         beside = (at < len(times)) & (times[np.minimum(at, len(times) - 1)] == self.t_us)
         found = np.digitize(np.abs(values[np.minimum(at, len(times) - 1)]), DISTANCE_EDGES_M)
         return np.where(beside, found, len(DISTANCE_EDGES_M) + 1)
-
-    def opacity_bin(self, edges: Sequence[float]) -> I64:
-        assert self.opacity is not None
-        return np.where(np.isfinite(self.opacity), np.digitize(self.opacity, edges), -1)
 
     def values(self, name: str, group: I64, k: int) -> F64:
         """Return the values of a metric at the steps of one group; times without a value have none."""
@@ -213,10 +211,6 @@ def _mean(b: Bin, name: str) -> Cell:
     return Cell(short(mean), "" if detail else f"no interval: it needs {LEAST_SCENES} scenes", detail, sort=mean)
 
 
-def _rate(n: int, seconds: float) -> str:
-    return f"{short(100 * n / seconds)} per 100 s driven" if seconds > 0 else ""
-
-
 def _labels(edges: Sequence[float], unit: str) -> list[str]:
     tail = f"\u00a0{unit}" if unit else ""
     if not edges:
@@ -247,7 +241,9 @@ def strata_chart(one: Strata) -> Chart | None:
                 axes.plot([x], [mean], MARKERS[b.variant % len(MARKERS)], color=colour, markersize=6)
         for k in range(1, len(known)):
             axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
-        axes.set_xticks(range(len(known)), [_tick(s.label, one.unit) for s in known], fontsize=8.5)
+        ticks = [s.label.replace(f"\u00a0{one.unit}", "") if one.unit else s.label for s in known]
+        ticks = [tick.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013") for tick in ticks]
+        axes.set_xticks(range(len(known)), ticks, fontsize=8.5)
         axes.set_xlim(-0.5, len(known) - 0.5)
         axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])  # the highest marker is whole
         axes.set_ylabel("m between plans in a row")
@@ -255,8 +251,3 @@ def strata_chart(one: Strata) -> Chart | None:
         axes.tick_params(length=0)
         svg = themed_svg(figure)
     return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", svg)
-
-
-def _tick(label: str, unit: str) -> str:
-    short_label = label.replace("\u00a0" + unit, "") if unit else label
-    return short_label.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013")

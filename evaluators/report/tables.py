@@ -12,7 +12,6 @@ from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.opening import Run
-from evaluators.report.events import COLLISION
 from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
@@ -29,6 +28,7 @@ from evaluators.report.numbers import (
     plural,
     short,
 )
+from evaluators.report.rollouts import COLLISION
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,9 @@ def metric_rows(
         facts = known.shown(name)
         percent = facts.in_percent
         reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
-        places = 1 if percent else _places(entries)
+        halves = [h for e in entries if (h := finite(e.get("ci95")))]
+        means = [m for e in entries if (m := finite(e.get("mean")))]
+        places = 1 if percent else max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
         cells = tuple(metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True))
         spans, scale_text = _spans(entries, 100.0 if percent else 1.0, facts.is_flag, "%" if percent else unit)
         rows.append(
@@ -140,12 +142,6 @@ def metric_cell(metric: MetricInfo, entry: Mapping[str, Any], places: int, reaso
         notes.append(str(entry["note"]))
     count = count_of(mean, n_rollouts) if metric.is_flag else ""
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
-
-
-def _places(entries: list[Mapping[str, Any]]) -> int:
-    halves = [h for e in entries if (h := finite(e.get("ci95")))]
-    means = [m for e in entries if (m := finite(e.get("mean")))]
-    return max(decimals(*means, digits=3), decimals(*halves, digits=2)) if halves else decimals(*means, digits=3)
 
 
 def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str) -> tuple[tuple[Span | None, ...], str]:
@@ -229,14 +225,10 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
         ("non-inferior", "worse"): "worse within margin",
         ("non-inferior", "better"): "better",
     }.get((verdict, str(entry.get("difference"))), verdict)
-    base, hint = str(entry.get("baseline") or "\u2014"), _hint(entry, scale, unit)
-    return PairRow(variant, base, metric.name, metric.help, diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
-
-
-def _hint(entry: Mapping[str, Any], scale: float, unit: str) -> str:
     margin, more = finite(entry.get("margin")), more_scenes_text(entry.get("more_scenes"))
     said = [f"margin {short(margin * scale, unit)}"] if margin is not None and entry.get("direction") != "none" else []
-    return "; ".join([*said, *([more] if more else [])])
+    base, hint = str(entry.get("baseline") or "\u2014"), "; ".join([*said, *([more] if more else [])])
+    return PairRow(variant, base, metric.name, metric.help, diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
 
 
 def _pair_note(entry: Mapping[str, Any]) -> str:
@@ -322,21 +314,14 @@ def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow
     is_large = len(groups) > MAX_SCENE_ROWS
     rank = {name: i for i, name in enumerate(interesting if interesting and is_large else run.scenes)}
     keys = sorted(groups, key=lambda k: (rank[k[0]], renderer_index[k[1]], k[2]))
-    rows = [_scene_row(run, key, groups[key], renderer_index[key[1]]) for key in keys[: TELLING_ROWS if is_large else MAX_SCENE_ROWS]]
+    rows = []
+    for key in keys[: TELLING_ROWS if is_large else MAX_SCENE_ROWS]:
+        done = [r for r in groups[key] if r.ok]
+        chips = tuple(_chip(run, r) for r in sorted(groups[key], key=lambda r: r.seed))
+        collisions, offroad = _count(done, COLLISION), _count(done, ("offroad",))
+        values = tuple(_mean(run, done, name) for name in SCENE_METRICS)
+        rows.append(SceneRow(*key, renderer_index[key[1]], chips, collisions, offroad, values))
     return rows, len(keys) - len(rows)
-
-
-def _scene_row(run: Run, key: tuple[str, str, str], rollouts: list[Rollout], variant: int) -> SceneRow:
-    done = [r for r in rollouts if r.ok]
-    chips = tuple(_chip(run, r) for r in sorted(rollouts, key=lambda r: r.seed))
-    return SceneRow(
-        *key,
-        variant=variant,
-        chips=chips,
-        collisions=_count(done, COLLISION),
-        offroad=_count(done, ("offroad",)),
-        values=tuple(_mean(run, done, name) for name in SCENE_METRICS),
-    )
 
 
 def _chip(run: Run, rollout: Rollout) -> Chip:
@@ -356,16 +341,18 @@ def _chip(run: Run, rollout: Rollout) -> Chip:
 
 def _count(done: list[Rollout], names: tuple[str, ...]) -> Cell:
     known = [r for r in done if any(r.metrics.get(name) is not None for name in names)]
-    if not known:
-        return missing("no rollout finished" if not done else "the metric is valid in no rollout")
     k = sum(r.flag(*names) for r in known)
-    return Cell(f"{k} of {len(known)}", sort=k / len(known), tone="worse" if k else "")
+    return Cell(f"{k} of {len(known)}", sort=k / len(known), tone="worse" if k else "") if known else _nothing(done)
 
 
 def _mean(run: Run, done: list[Rollout], name: str) -> Cell:
     values = [v for r in done if (v := r.metrics.get(name)) is not None]
     if not values:
-        return missing("no rollout finished" if not done else "the metric is valid in no rollout")
+        return _nothing(done)
     mean = float(np.mean(values))
     note = "" if len(values) == len(done) else f"valid in {len(values)} of {len(done)}"
     return Cell(f"{fixed(100 * mean, 1)}\u00a0%" if run.table.shown(name).in_percent else short(mean, "m"), note, sort=mean)
+
+
+def _nothing(done: list[Rollout]) -> Cell:
+    return missing("no rollout finished" if not done else "the metric is valid in no rollout")

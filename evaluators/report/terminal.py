@@ -75,16 +75,16 @@ def ending_lines(run: Run) -> list[str]:
         run: A finished run.
     """
     finding = find(run)
-    lines = [_line("verdict", finding.title)]
-    lines += [_line("", f"{finding.name_of(point)}: {point.lead}") for point in finding.points if point.lead]
+    lines = [labelled("verdict", finding.title)]
+    lines += [labelled("", f"{finding.name_of(point)}: {point.lead}") for point in finding.points if point.lead]
     cost = cost_text(run.summary)
-    return [*lines, *([_line("cost", cost)] if cost else [])]
+    return [*lines, *([labelled("cost", cost)] if cost else [])]
 
 
 def next_line(run: Run) -> str:
     """Return the line that names the next command worth trying, and why."""
     command, why = next_command(run, find(run))
-    return _line("next", f"{shlex.join(command)}   # {why}")
+    return labelled("next", f"{shlex.join(command)}   # {why}")
 
 
 def cost_text(summary: Mapping[str, Any]) -> str:
@@ -119,12 +119,9 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
         return _probe(run, flips[0].other, flips[0].base.renderer), "the same poses behind both: where the plans part"
     if finding.tone == "unclear":
         return _again(run, ",".join(run.renderers), [MORE_SCENES]), "more scenes: the interval is too wide to decide"
-    worst = max((r for r in run.rollouts if r.renderer == finding.points[0].name), key=_away, default=run.rollouts[0])
+    mine = [r for r in run.rollouts if r.renderer == finding.points[0].name]
+    worst = max(mine, key=lambda r: r.metrics.get("lateral_distance_m") or 0.0, default=run.rollouts[0])
     return _probe(run, worst, finding.points[0].baseline), "the same poses behind both renderers: how far the plans differ, frame by frame"
-
-
-def _away(rollout: Rollout) -> float:
-    return rollout.metrics.get("lateral_distance_m") or 0.0
 
 
 def _probe(run: Run, rollout: Rollout, baseline: str) -> list[str]:
@@ -141,5 +138,6 @@ def _again(run: Run, renderers: str, scenes: list[str], policy: str = "") -> lis
     return ["simrun", "--renderer", renderers, "--policy", policy or ",".join(run.policies), "--seeds", str(seeds), *scenes]
 
 
-def _line(label: str, text: str) -> str:
+def labelled(label: str, text: str) -> str:
+    """Print a line of the end of a command."""
     return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")

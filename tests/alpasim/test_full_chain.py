@@ -27,7 +27,7 @@ from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.wire import SERVICE_PATHS
 from alpasim_plugin.wire.services import OPTIONS, handlers, methods
 from evaluators import reduce_rollout, score
-from evaluators.presets import preset
+from evaluators.metrics.presets import preset
 from scenarios.library import shipped_names
 from scenarios.load import load_scenario
 

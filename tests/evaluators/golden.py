@@ -19,7 +19,7 @@ from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scene
 from alpasim_plugin.log import read_asl
 from evaluators import score
 from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, scene_score
-from evaluators.presets import Preset
+from evaluators.metrics.presets import Preset
 from scenarios.usdz import read_usdz_scene
 
 RUN = ("00000000-0000-4000-8000-00000000000a", "golden-dev")

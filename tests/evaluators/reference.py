@@ -10,10 +10,10 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.core.types import F64, RolloutLog
-from evaluators.footprint import origin_of
-from evaluators.presets import PRESETS, Preset
-from evaluators.reference import actor_corners, exact, point_to_segment, sides_of, touch
-from evaluators.route import recorded_path
+from evaluators.metrics.footprint import origin_of
+from evaluators.metrics.presets import PRESETS, Preset
+from evaluators.metrics.reference import actor_corners, exact, point_to_segment, sides_of, touch
+from evaluators.metrics.route import recorded_path
 
 
 def convex_contains(ring: F64, body: F64) -> bool:

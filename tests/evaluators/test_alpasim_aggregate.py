@@ -23,7 +23,7 @@ from evaluators.alpasim import (
     scene_score,
 )
 from evaluators.alpasim.settings import SceneScoreSettings
-from evaluators.base import series
+from evaluators.metrics.score import series
 from tests.evaluators.golden import RUN, SETS, close, golden_set
 
 ALPASIM = PRESETS["alpasim"]

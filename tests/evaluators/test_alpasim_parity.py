@@ -10,7 +10,7 @@ import pytest
 
 from evaluators import PRESETS, reduce_rollout
 from evaluators.alpasim import load_settings
-from evaluators.presets import Preset
+from evaluators.metrics.presets import Preset
 from tests.evaluators.golden import close, expected, scored
 
 ALPASIM = PRESETS["alpasim"]

@@ -11,7 +11,7 @@ from alpasim_plugin.core.types import LaneMap, RolloutLog, Trajectory
 from evaluators import METRICS, PRESETS, preset, reduce_rollout, rollout_values, score
 from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, results_summary, scene_score
 from evaluators.alpasim.settings import Modifiers, SceneScoreSettings
-from evaluators.route import from_corridor, to_path
+from evaluators.metrics.route import from_corridor, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.golden import scored
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from alpasim_plugin.core.geometry import rectangle_corners
 from alpasim_plugin.core.types import Box
 from evaluators import PRESETS, score
-from evaluators.footprint import ActorTable, ego_footprints, origin_of
-from evaluators.reference import contacts_by_step
-from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts
+from evaluators.metrics.contact import FRONT, LATERAL, REAR, find_contacts
+from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.metrics.reference import contacts_by_step
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 from tests.examples import examples
 

@@ -15,11 +15,11 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.run_folder import columns
 from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.sides import RendererRows
+from alpasim_plugin.run_folder.sides import RendererRows, by_renderer, metric_names
 from evaluators import aggregate, paired
-from evaluators.aggregate.overall import numbers
-from evaluators.aggregate.paired import base_pairs
-from evaluators.gate import GateSpec, judge, judge_table
+from evaluators.statistics.gate import GateSpec, judge, judge_table
+from evaluators.statistics.paired import base_pairs
+from evaluators.statistics.summary import numbers
 
 METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacle_m")
 KEYS = ("renderer", "policy", "scene", "seed", "status", "failure_class")
@@ -63,7 +63,7 @@ def by_rows(rows: Sequence[dict[str, Any]], baseline: str | None, bases: Mapping
         there = list(dict.fromkeys(row["renderer"] for row in mine))
         chosen = baseline if baseline in there else there[0]
         parts = {"metrics": aggregate(mine), "paired": paired(mine, chosen) if len(there) > 1 else {}}
-        parts["paired_with_base"] = base_pairs(mine, chosen if len(there) > 1 else None, bases)
+        parts["paired_with_base"] = base_pairs(by_renderer(mine), metric_names(mine), chosen if len(there) > 1 else None, bases)
         for block, part in parts.items():
             out[block] |= {name if len(policies) == 1 else f"{name}/{policy}": entry for name, entry in part.items()}
     return out

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.sequential.control import adjusted_draws
-from evaluators.sequential.decision import outcome_of, state_after
-from evaluators.sequential.question import Question, metric_question
+from evaluators.statistics.sequential.control import adjusted_draws
+from evaluators.statistics.sequential.decision import outcome_of, state_after
+from evaluators.statistics.sequential.question import Question, metric_question
 
 
 def rng(key: int) -> np.random.Generator:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.aggregate.outcome import EXIT_CODES, SEVERITY, Outcome, outcome_of_failures, worst
-from evaluators.gate import GateSpec, MetricRule, judge, load_gate
-from evaluators.gate.spec import shipped_gates
+from evaluators.statistics.gate import GateSpec, MetricRule, judge, load_gate, shipped_gates
+from evaluators.statistics.verdicts import EXIT_CODES, SEVERITY, Outcome, outcome_of_failures, worst
 
 SCENES = 30
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import lane_polygon, rectangle_corners
 from alpasim_plugin.core.types import Lane, LaneMap
-from evaluators import PRESETS, reduce_rollout, score, surface
-from evaluators.surface import MARGIN_M, Region, Surface, closed_union
+from evaluators import PRESETS, reduce_rollout, score
+from evaluators.metrics import surface
+from evaluators.metrics.surface import MARGIN_M, Region, Surface, closed_union
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference_strict import depth_by_points
 from tests.examples import examples

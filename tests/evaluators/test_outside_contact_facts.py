@@ -10,8 +10,8 @@ import pytest
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.types import Actor, Box, RolloutLog, Trajectory
 from evaluators import Preset
-from evaluators.footprint import ActorTable, ego_footprints
-from evaluators.step_contact import find_contacts
+from evaluators.metrics.contact import find_contacts
+from evaluators.metrics.footprint import ActorTable, ego_footprints
 
 OWN_SIZE = Preset(name="own size")
 EGO = Box(4.049 + 1.127, 2.297, 1.8)  # front and rear overhang from the rear axle

@@ -11,8 +11,7 @@ from scipy import stats
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
 from evaluators import aggregate
-from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
-from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, rate_interval, wilson_rate
+from evaluators.statistics.intervals import cluster_bootstrap, clustered, design_effect, exact_rate, rate_interval, redraws, wilson_rate
 from tests.evaluators.test_tables_over_rollouts import rows_of
 from tests.examples import examples
 

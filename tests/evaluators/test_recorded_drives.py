@@ -12,8 +12,8 @@ import pytest
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, se3, trajectory_from_poses
 from alpasim_plugin.core.types import LaneMap, RolloutLog, Scene
 from evaluators import PRESETS, rollout_values, score
-from evaluators.footprint import ActorTable, ego_footprints
-from evaluators.step_contact import find_contacts
+from evaluators.metrics.contact import find_contacts
+from evaluators.metrics.footprint import ActorTable, ego_footprints
 from scenarios.argoverse import read_argoverse
 from scenarios.commonroad import read_commonroad
 from scenarios.cosmos import read_cosmos

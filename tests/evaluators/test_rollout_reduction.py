@@ -9,7 +9,7 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError
 from evaluators import PRESETS, reduce_rollout, rollout_values
-from evaluators.base import series
+from evaluators.metrics.score import series
 
 T = np.arange(6, dtype=np.int64) * 100_000
 PAPER = PRESETS["paper"]

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluators import rollout_values, score
-from evaluators.reference import point_to_segment
-from evaluators.route import beside, progress_so_far, to_path
+from evaluators.metrics.reference import point_to_segment
+from evaluators.metrics.route import beside, progress_so_far, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step
 from tests.examples import examples
@@ -129,7 +129,7 @@ def is_ambiguous(path, point):
 def test_progress_so_far_is_the_same_in_blocks(monkeypatch):
     points = np.cumsum(np.ones((50, 2)), axis=0)
     whole = progress_so_far(points, points * 0.9)
-    monkeypatch.setattr("evaluators.route._ROWS", 3)
+    monkeypatch.setattr("evaluators.metrics.route._ROWS", 3)
     np.testing.assert_array_equal(progress_so_far(points, points * 0.9), whole)
 
 

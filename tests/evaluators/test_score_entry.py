@@ -11,8 +11,8 @@ import pytest
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.types import Box, LoggedPlan, Trajectory
 from evaluators import METRICS, MetricInfo, resolve_evaluators, rollout_values, score
-from evaluators.base import run_evaluator, series
 from evaluators.metrics import MetricTable
+from evaluators.metrics.score import run_evaluator, series
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
 
 

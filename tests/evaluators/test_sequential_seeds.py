@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.run_folder.sides import by_renderer
-from evaluators.sequential.differences import SceneDifferences, scene_differences
-from evaluators.sequential.seeds import best_seeds, next_seeds, scarce_seeds, variances
+from evaluators.statistics.sequential.differences import (
+    SceneDifferences,
+    best_seeds,
+    next_seeds,
+    scarce_seeds,
+    scene_differences,
+    variances,
+)
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0, 4.0, 30.0])

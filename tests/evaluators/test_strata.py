@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.sequential import asymptotic, betting
-from evaluators.sequential.control import Control, adjusted_draws, predictions
-from evaluators.sequential.draws import Draws
-from evaluators.sequential.plan import Plan
-from evaluators.sequential.question import metric_question
-from evaluators.sequential.strata import Strata, families_of, pivotal_sample, stratified
+from evaluators.statistics.sequential import asymptotic, betting
+from evaluators.statistics.sequential.control import Control, adjusted_draws, predictions
+from evaluators.statistics.sequential.draws import Draws, Strata, families_of, pivotal_sample, stratified
+from evaluators.statistics.sequential.line import Plan
+from evaluators.statistics.sequential.question import metric_question
 
 PLAN = Plan(0.1, 50, 0.05)
 

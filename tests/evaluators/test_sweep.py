@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluators.sweep import TOUCH_M, Motions, first_contact, gaps, slope
+from evaluators.metrics.sweep import TOUCH_M, Motions, first_contact, gaps, slope
 from tests.evaluators.reference_strict import Motion, first_touch, separation
 from tests.examples import examples
 

@@ -15,11 +15,10 @@ from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.geometry import wrap_angle, yaw_from_quat
 from alpasim_plugin.core.types import Box
 from evaluators import PRESETS, reduce_rollout, score
-from evaluators.collision import SIDES, contact_events
-from evaluators.footprint import ActorTable, ego_footprints, origin_of
-from evaluators.reference import contacts_by_step
-from evaluators.step_contact import find_contacts
-from evaluators.swept_contact import PLACE_M, find_swept
+from evaluators.metrics.collision import SIDES, contact_events
+from evaluators.metrics.contact import PLACE_M, find_contacts, find_swept
+from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.metrics.reference import contacts_by_step
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 from tests.evaluators.reference_strict import Motion, first_touch, side_at
 from tests.examples import examples

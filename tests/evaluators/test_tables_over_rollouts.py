@@ -9,9 +9,10 @@ import pytest
 from scipy import stats
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.run_folder.sides import by_renderer, metric_names
 from evaluators import aggregate, censoring, paired
-from evaluators.aggregate.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
-from evaluators.aggregate.paired import base_pairs
+from evaluators.statistics.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
+from evaluators.statistics.paired import base_pairs
 
 
 def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
@@ -119,7 +120,7 @@ def test_nested_metrics_as_in_manifests_are_read_too():
             "scene": s,
             "seed": 0,
             "status": "ok",
-            "metrics": {"offroad": {"value": v, "valid": v is not None}},
+            "metrics": {"offroad": {"value": v, "valid": v is not None, "reason": ""}},
         }
         for s, v in (("x", 1.0), ("y", 0.0), ("z", None))
     ]
@@ -309,9 +310,9 @@ def test_intervals_of_bounded_quantities_stay_within_their_bounds():
 def test_a_fixer_is_compared_with_what_it_repairs_too():
     rows = rows_of([[1.0], [2.0], [3.0]], renderer="clean") + rows_of([[1.5], [2.6], [3.4]], renderer="3dgs")
     rows += rows_of([[1.2], [2.1], [3.2]], renderer="onefixer")
-    found = base_pairs(rows, "clean", {"onefixer": "3dgs", "onefixer+clean": "clean"})
+    found = base_pairs(by_renderer(rows), metric_names(rows), "clean", {"onefixer": "3dgs", "onefixer+clean": "clean"})
     assert list(found) == ["onefixer"]
     entry = found["onefixer"]["route_distance_m"]
     assert (entry["baseline"], entry["diff"]) == ("3dgs", pytest.approx(-1.0 / 3.0))
     assert entry == paired(rows, "3dgs")["onefixer"]["route_distance_m"]
-    assert base_pairs(rows, "3dgs", {"onefixer": "3dgs"}) == {}  # paired with it already
+    assert base_pairs(by_renderer(rows), metric_names(rows), "3dgs", {"onefixer": "3dgs"}) == {}  # paired with it already

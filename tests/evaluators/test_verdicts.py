@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from evaluators import paired
-from evaluators.aggregate.paired import flag_interval
-from evaluators.aggregate.verdict import difference, verdict
+from evaluators.statistics.paired import flag_interval
+from evaluators.statistics.verdicts import difference, verdict
 from tests.evaluators.test_tables_over_rollouts import rows_of
 
 

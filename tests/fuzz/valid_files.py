@@ -163,8 +163,8 @@ def make_run(folder: Path) -> None:
 
 
 def make_baseline(folder: Path) -> None:
-    from evaluators.gate import write_baseline
     from evaluators.opening import read_run
+    from evaluators.statistics.baselines import write_baseline
 
     make_run(folder)
     write_baseline(read_run(folder / "run"), folder / "baseline.json")

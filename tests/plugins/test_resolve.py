@@ -136,7 +136,7 @@ def own_files(path: Path) -> set[str]:
 def test_the_digest_follows_names_that_our_packages_import_lazily(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text("from evaluators import PRESETS\nfrom alpasim_plugin.gaussians import (\n    GaussianCloud,\n)\n")
-    assert {"evaluators/presets.py", "alpasim_plugin/gaussians/cloud.py"} <= own_files(file)
+    assert {"evaluators/metrics/presets.py", "alpasim_plugin/gaussians/cloud.py"} <= own_files(file)
     assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" not in own_files(file)
 
 

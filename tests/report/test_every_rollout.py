@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from evaluators.opening import Run, read_run
-from evaluators.report import every_rollout
-from evaluators.report.every_rollout import COLLIDED, FAILED, HAS_CLIP, HAS_FOLDER, LEFT_ROAD, rollout_block
+from evaluators.report import rollouts
+from evaluators.report.rollouts import COLLIDED, FAILED, HAS_CLIP, HAS_FOLDER, LEFT_ROAD, rollout_block
 
 TYPES = {"u8": "<u1", "u32": "<u4", "f32": "<f4"}
 
@@ -76,7 +76,7 @@ def test_a_folder_outside_the_run_is_not_linked(run: Run, tmp_path: Path) -> Non
 
 
 def test_more_rollouts_than_a_page_can_hold_are_counted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(every_rollout, "MAX_ROLLOUTS", 5)
+    monkeypatch.setattr(rollouts, "MAX_ROLLOUTS", 5)
     block = rollout_block(run)
     assert (block.shown, block.left_out) == (5, len(run.rollouts) - 5)
     assert unpacked(block.data)[0]["rows"] == 5

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.opening import Run, read_run
 from evaluators.report.birdseye import path_data, scene_view
-from evaluators.report.events import events_of, read_series
+from evaluators.report.rollouts import events_of, read_series
 from tests.report.make_run import Plan, make_run
 
 VARIANTS = {("a", "p"): (0, 0)}

@@ -9,9 +9,9 @@ from rich.console import Console
 
 from evaluators.opening import read_run
 from evaluators.report import render_table
-from evaluators.report.failures import failure_rows, ledger
 from evaluators.report.fixers import speed
 from evaluators.report.numbers import DASH
+from evaluators.report.provenance import failure_rows, ledger
 from evaluators.report.tables import columns, metric_rows, pair_rows, scene_rows
 from tests.report.make_run import Plan, make_run
 

@@ -11,13 +11,11 @@ from typing import Any
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from evaluators.gate.across import compare_runs
 from evaluators.opening import read_run
-from evaluators.runs.changes import changes
-from evaluators.runs.entry import RunEntry
-from evaluators.runs.find import find_runs
-from evaluators.runs.page import render_trend
-from evaluators.runs.trend import Trend, trend
+from evaluators.report.runs import RunEntry, find_runs
+from evaluators.report.trend import Trend, changes, trend
+from evaluators.report.trend_page import render_trend
+from evaluators.statistics.across import compare_runs
 from tests.runs.make_many import COMMITS, SCENES, Many, info_of, make_one, unfinish
 
 DAYS = tuple(f"2026-03-0{day}T02:00:00+00:00" for day in range(1, 8))

@@ -20,7 +20,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.lab.bench.executors import bench_executor, local_nodes
-from evaluators.sequential.record import read_decision
+from evaluators.statistics.sequential.question import read_decision
 from tests.runtime.cluster_nodes import Nodes
 from tests.runtime.grey_policy import BY_GREY
 from tests.runtime.grey_renderer import GREY

@@ -16,8 +16,7 @@ from alpasim_plugin.runtime.decide import Decided, Design, drawing_order, execut
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from evaluators.opening import read_run
 from evaluators.report.html import render_report
-from evaluators.sequential.question import Question, metric_question
-from evaluators.sequential.record import DECISION, read_decision
+from evaluators.statistics.sequential.question import DECISION, Question, metric_question, read_decision
 from scenarios.suite import ScenarioRef, expand
 from tests.runtime.grey_policy import BY_GREY
 from tests.runtime.grey_renderer import GREY

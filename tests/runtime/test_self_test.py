@@ -8,7 +8,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.runtime.self_test import CONTROL, REFERENCE, SUITE, Trial, _judge, broken_renderers
-from evaluators.gate import GateSpec, MetricRule, load_gate
+from evaluators.statistics.gate import GateSpec, MetricRule, load_gate
 from scenarios.suite import load_suite
 from tests.evaluators.test_gate import rows
 

@@ -25,7 +25,7 @@ from alpasim_plugin.viewer.page_data import cell_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
 from alpasim_plugin.viewer.write import FLIPS_PAGE, write_flips_page, write_page
 from evaluators.opening import read_run
-from evaluators.report.events import SERIES, clock_zero_us, events_of
+from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
 from tests.report.make_run import DT_US, Plan
 from tests.viewer.make_watched import BARS, WATCHED, make_watched, picture
 

@@ -18,8 +18,8 @@ import alpasim_plugin.lab.video_metrics.facts  # noqa: F401  declares: the proce
 from alpasim_plugin.core.processes import resident_mb
 from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 from alpasim_plugin.run_folder.columns import RolloutTable
-from evaluators.aggregate.summary import aggregate, aggregate_sides
 from evaluators.metrics import METRICS
+from evaluators.statistics.summary import aggregate, aggregate_sides
 
 RENDERERS = ("clean", "3dgs")
 FAILED, INVALID = 0.01, 0.02  # shares of rollouts that failed, and of values that are not valid

@@ -28,8 +28,8 @@ from alpasim_plugin.lab.bench.interval_study import (
     pairs,
     power_of,
 )
-from evaluators.aggregate.intervals import t_bounds
-from evaluators.aggregate.power import more_scenes, scenes_needed
+from evaluators.statistics.intervals import t_bounds
+from evaluators.statistics.verdicts import more_scenes, scenes_needed
 
 SCENES = (5, 10, 20, 60, 150)
 LEAST, MOST = 0.93, 0.97

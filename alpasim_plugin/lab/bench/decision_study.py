@@ -1,7 +1,7 @@
 """Monte-Carlo study of sequential decisions: errors over all looks, and scenes against a fixed design of equal power.
 
 Scene differences come from the model of `interval_study` (rates), or from distributions without bounds. What is under test is what
-``simrun decide`` runs: `evaluators.sequential`.
+``simrun decide`` runs: `evaluators.statistics.sequential`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,13 @@ from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.lab.bench.interval_study import RATES, SHARED_NOISE, Design, pairs
-from evaluators.aggregate.power import scenes_needed
-from evaluators.sequential import asymptotic, betting
-from evaluators.sequential.control import predictions
-from evaluators.sequential.differences import SceneDifferences
-from evaluators.sequential.draws import Draws, independent, without_replacement
-from evaluators.sequential.multiplicity import closed
-from evaluators.sequential.plan import Plan
-from evaluators.sequential.seeds import next_seeds
-from evaluators.sequential.strata import Strata, stratified
+from evaluators.statistics.sequential import asymptotic, betting
+from evaluators.statistics.sequential.control import predictions
+from evaluators.statistics.sequential.decision import closed
+from evaluators.statistics.sequential.differences import SceneDifferences, next_seeds
+from evaluators.statistics.sequential.draws import Draws, Strata, independent, stratified, without_replacement
+from evaluators.statistics.sequential.line import Plan
+from evaluators.statistics.verdicts import scenes_needed
 
 ALPHA = 0.05
 GAP = RATES[0] - RATES[1]  # the difference of docs/experiments/interval-coverage.md

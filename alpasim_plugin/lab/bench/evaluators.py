@@ -21,15 +21,14 @@ from scipy.spatial import cKDTree
 
 from alpasim_plugin.core.geometry import arc_lengths, inverse, lane_polygon, offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
-from evaluators.base import score
-from evaluators.collision import SIDES
-from evaluators.footprint import ActorTable, ego_footprints, origin_of
-from evaluators.offroad import containment
-from evaluators.presets import PRESETS, Preset
-from evaluators.reference import contacts_by_step, ego_corners, road_by_step
-from evaluators.road import Road
-from evaluators.step_contact import Contacts, find_contacts
-from evaluators.swept_contact import find_swept
+from evaluators.metrics.collision import SIDES
+from evaluators.metrics.contact import Contacts, find_contacts, find_swept
+from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.metrics.offroad import containment
+from evaluators.metrics.presets import PRESETS, Preset
+from evaluators.metrics.reference import contacts_by_step, ego_corners, road_by_step
+from evaluators.metrics.road import Road
+from evaluators.metrics.score import score
 
 PAPER, STRICT = PRESETS["paper"], PRESETS["strict"]
 STEP_US = 100_000

@@ -15,9 +15,8 @@ from scipy import stats
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
-from evaluators.aggregate.bootstrap import resampled_means
-from evaluators.aggregate.intervals import TAIL, Z95, logit_t_bounds, t_bounds
-from evaluators.aggregate.paired import flag_bounds
+from evaluators.statistics.intervals import TAIL, Z95, logit_t_bounds, resampled_means, t_bounds
+from evaluators.statistics.paired import flag_bounds
 
 CORRELATIONS = (0.0, 0.3, 0.6, 0.8)  # within a scene, latent
 PAPER_SCENES, PAPER_SEEDS = 60, 5

@@ -9,11 +9,11 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import RolloutLog, Scene
-from evaluators.aggregate.reduce import reduce_rollout
-from evaluators.base import score
 from evaluators.metrics import METRICS
-from evaluators.presets import Preset
-from evaluators.presets import preset as find_preset
+from evaluators.metrics.presets import Preset
+from evaluators.metrics.presets import preset as find_preset
+from evaluators.metrics.score import score
+from evaluators.statistics.reduce import reduce_rollout
 
 SAME = 1e-3  # values nearer than this are the same: presets differ in precision too
 

@@ -27,8 +27,8 @@ from alpasim_plugin.lab.bench.raster import SKY, driving_camera, driving_like_sc
 from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.runtime.cell import run_cell
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from evaluators.aggregate.overall import numbers
-from evaluators.base import score
+from evaluators.metrics.score import score
+from evaluators.statistics.summary import numbers
 from scenarios.suite import expand
 
 Part = Literal["raster", "loop", "evaluators", "aggregation"]

@@ -12,7 +12,7 @@ from alpasim_plugin.lab.bench.preset_conversion import as_markdown, conversion_t
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
-from evaluators.presets import preset as find_preset
+from evaluators.metrics.presets import preset as find_preset
 
 EPILOG = """
 Examples:

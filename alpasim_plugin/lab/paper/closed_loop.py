@@ -16,12 +16,12 @@ from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.tables import markdown_table, paper_against_ours
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.run_folder.sides import Row, by_renderer
-from evaluators.aggregate.intervals import Interval
-from evaluators.aggregate.paired import compare, paired_sides
-from evaluators.aggregate.summary import aggregate_sides
 from evaluators.report.ci import cell_text, metric_label
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, metric_rows, p_text, pair_rows
+from evaluators.statistics.intervals import Interval
+from evaluators.statistics.paired import compare, paired_sides
+from evaluators.statistics.summary import aggregate_sides
 
 TABLE = "closed-loop"  # of the paper
 BASELINE = "3dgs"
@@ -51,7 +51,7 @@ class Driven(Measured):
 
     Args:
         policy: Who drove.
-        rows: A rollout each, as `evaluators.aggregate.summary.aggregate` takes them; ``renderer`` is the arm's name.
+        rows: A rollout each, as `evaluators.statistics.summary.aggregate` takes them; ``renderer`` is the arm's name.
     """
 
     def __init__(self, policy: str, rows: Sequence[Row]) -> None:
@@ -81,7 +81,7 @@ class Driven(Measured):
         return Interval(entry["mean"], entry["mean"] - entry["ci95"], entry["mean"] + entry["ci95"], method="1.96 sigma / sqrt(N)")
 
     def difference(self, metric: str, first: str, second: str) -> Difference:
-        """Return the paired difference of two renderers with scenes as the unit; see `evaluators.aggregate.paired.compare`.
+        """Return the paired difference of two renderers with scenes as the unit; see `evaluators.statistics.paired.compare`.
 
         Raises:
             EvaluatorError: They share fewer than two rollouts.

@@ -15,7 +15,7 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.lab.learned_metrics.frechet import frechet_distance
 from alpasim_plugin.lab.learned_metrics.swapping import SwapTest, swap_test
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
-from evaluators.aggregate.intervals import Interval, t_interval
+from evaluators.statistics.intervals import Interval, t_interval
 
 ALPHA = 0.05
 SWAPS = 2000  # of whole clips, where not all of them are taken; no p-value is below 1 / (SWAPS + 1)

@@ -13,7 +13,7 @@ from alpasim_plugin.lab.learned_metrics.frechet import frechet_distance
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.tables import markdown_table
 from alpasim_plugin.lab.video_metrics.facts import DRIFT, PSNR
-from evaluators.aggregate.intervals import t_interval
+from evaluators.statistics.intervals import t_interval
 
 WINDOW = 93  # frames: the length of the paper's training clips
 FEATURE_FRAMES = 16  # of a vector of `fd_syn_16`, one after the other

@@ -9,7 +9,7 @@ from typing import Literal
 from alpasim_plugin.lab.paper.claims import CLAIMS, CLOSE, Claim, Contest
 from alpasim_plugin.lab.paper.measured import ALPHA, Difference, Measured, beyond
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
-from evaluators.aggregate.intervals import Interval
+from evaluators.statistics.intervals import Interval
 
 Outcome = Literal["for", "against", "open", "not measured"]
 Verdict = Literal["holds", "does not hold", "undecided at our scale", "not measured"]

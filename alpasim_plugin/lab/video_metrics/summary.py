@@ -15,8 +15,8 @@ import numpy as np
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.lab.video_metrics.facts import FACTS, KNOWN, MS, SOMETIMES, WARP
 from alpasim_plugin.run_folder.sides import by_renderer
-from evaluators.aggregate.intervals import t_interval
-from evaluators.aggregate.paired import compare
+from evaluators.statistics.intervals import t_interval
+from evaluators.statistics.paired import compare
 
 Row = Mapping[str, Any]
 TRUTH = "truth"  # the variant of the ground-truth frames: only metrics without a reference are measured on it
@@ -34,7 +34,7 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
     Returns:
         ``arms``: VARIANT -> METRIC -> ``mean``, ``ci95`` ([low, high], t over clips, or None with ``reason``), ``n``, ``unit`` and
         ``direction``;
-        ``paired``: VARIANT -> METRIC -> what `evaluators.aggregate.paired.compare` gives;
+        ``paired``: VARIANT -> METRIC -> what `evaluators.statistics.paired.compare` gives;
         ``by_frame``: VARIANT -> METRIC -> ``first`` and ``last`` frame of each window, ``mean``, ``low``, ``high`` over clips;
         ``identical``, ``events``, ``frames``, ``clips``: by variant.
 

@@ -63,11 +63,11 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "perfect": ("alpasim_plugin.control.base:PerfectController", "the ego is exactly where its plan says"),
     },
     "evaluator": {
-        "collision": ("evaluators.collision:FACTORY", "contact with other actors by class, and the distance to them"),
-        "offroad": ("evaluators.offroad:FACTORY", "off-road, wrong lane and the distance to the lanes' border"),
-        "route": ("evaluators.route:FACTORY", "distance from the recorded drive, progress and distance driven"),
-        "plan": ("evaluators.plan:FACTORY", "plan deviation, open-loop collision and minADE of the plans"),
-        "image_health": ("evaluators.image_health:FACTORY", "black and frozen camera images"),
+        "collision": ("evaluators.metrics.collision:FACTORY", "contact with other actors by class, and the distance to them"),
+        "offroad": ("evaluators.metrics.offroad:FACTORY", "off-road, wrong lane and the distance to the lanes' border"),
+        "route": ("evaluators.metrics.route:FACTORY", "distance from the recorded drive, progress and distance driven"),
+        "plan": ("evaluators.metrics.plan:FACTORY", "plan deviation, open-loop collision and minADE of the plans"),
+        "image_health": ("evaluators.metrics.image_health:FACTORY", "black and frozen camera images"),
     },
     "source": {
         "argoverse": ("scenarios.sources:Argoverse", "Argoverse 2 log folder"),

@@ -24,7 +24,7 @@ from alpasim_plugin.lab.bench.interval_study import (
     pairs,
     power_of,
 )
-from evaluators.aggregate.power import more_scenes, scenes_needed, scenes_without_event
+from evaluators.statistics.verdicts import more_scenes, scenes_needed, scenes_without_event
 
 REPEATS = 4000  # standard error of a coverage of 95 %: 0.35 points
 

@@ -45,7 +45,7 @@ def test_the_profile_of_the_rasteriser_names_its_kernels(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "where"), [("loop", "rasterize_cpu"), ("evaluators", "step_contact"), ("aggregation", "")])
+@pytest.mark.parametrize(("part", "where"), [("loop", "rasterize_cpu"), ("evaluators", "contact.find_contacts"), ("aggregation", "")])
 def test_the_profile_of_a_part_names_its_own_functions(part, where):
     rows = profile(part, 1)
     assert any(where in row.where for row in rows[:12])

@@ -17,7 +17,8 @@ from alpasim_plugin.lab.paper.document import Findings, document, draw_figures
 from alpasim_plugin.lab.paper.published import published
 from alpasim_plugin.lab.paper.tables import difference_text
 from alpasim_plugin.lab.paper.verdict import judge_claims
-from evaluators.aggregate import aggregate, paired
+from evaluators.statistics.paired import paired
+from evaluators.statistics.summary import aggregate
 
 SCENES, SEEDS = 20, 3
 

@@ -1,0 +1,120 @@
+"""Contact with other actors: flags by side, the least gap, and where contact is searched between steps, time and place.
+
+At fault is front or lateral. By the paper's protocol only logged instants are looked at (`evaluators.metrics.contact`); preset ``strict``
+searches the motion between them as well (`evaluators.metrics.contact`), and a row then says what happened since the row before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene
+from evaluators.metrics.contact import FRONT, LATERAL, REAR, SweptContacts, find_contacts, find_swept, last_per_step
+from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.metrics.presets import Preset
+from evaluators.metrics.presets import preset as find_preset
+from evaluators.metrics.score import handover_us, series, with_preset
+
+SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
+NO_CONTACT = "nothing touches the ego"
+
+
+@dataclass(frozen=True)
+class ContactEvent:
+    """One actor begins to touch the ego."""
+
+    actor_id: str
+    t_s: float  # since the log's first ego pose
+    side: str  # front | rear | lateral
+    x_m: float  # where on the footprint: rig frame, forward of the rear axle
+    y_m: float  # rig frame, left
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields by name, for a manifest; micrometres and tenths of microseconds are rounded away."""
+        return {
+            "actor_id": self.actor_id,
+            "t_s": round(self.t_s, 6),
+            "side": self.side,
+            "x_m": round(self.x_m, 5),
+            "y_m": round(self.y_m, 5),
+        }
+
+
+def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tuple[ContactEvent, ...]:
+    """Return the beginning of every contact at or between steps, in order of time.
+
+    Args:
+        rollout: A log that `evaluators.metrics.score.check_rollout` accepts.
+        preset: Sizes of the footprints.
+
+    Returns:
+        One entry each time an actor begins to touch the ego, however short; the warm-up included.
+    """
+    chosen = find_preset(preset)
+    origin = origin_of(rollout.ego, chosen)
+    ego, actors = ego_footprints(rollout, chosen, origin), ActorTable(rollout, chosen, origin)
+    at_steps, _ = find_contacts(ego, actors, rollout.ego.t_us)
+    begun = find_swept(ego, actors, rollout.ego.t_us, at_steps, handover_us(rollout)).onsets
+    places = in_rig(begun.xy, rollout)
+    return tuple(
+        ContactEvent(actors.ids[begun.actor[k]], float(begun.t_s[k]), SIDES[int(begun.side[k])], float(places[k, 0]), float(places[k, 1]))
+        for k in np.argsort(begun.t_s, kind="stable")
+    )
+
+
+def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*`` where motion is searched too."""
+    origin = origin_of(rollout.ego, preset)
+    t_us = rollout.ego.t_us
+    ego, actors = ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin)
+    contacts, gap_m = find_contacts(ego, actors, t_us)
+    if preset.hits == "last":
+        contacts = last_per_step(contacts, ego, actors, t_us)
+    step, side = contacts.step, contacts.side
+    first: list[MetricSeries] = []
+    if preset.contact == "between_steps":
+        swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
+        step, side, first = swept.step, swept.side, _first_contacts(rollout, swept)
+        gap_m[step] = 0.0
+    touched = np.zeros((3, len(t_us)), dtype=np.bool_)
+    touched[side, step] = True
+    front, rear, lateral = touched[FRONT], touched[REAR], touched[LATERAL]
+    there = np.isfinite(gap_m)
+    return [
+        series("collision_any", t_us, front | rear | lateral),
+        *([] if preset.hits == "last" else [series("collision_at_fault", t_us, front | lateral)]),
+        series("collision_front", t_us, front),
+        series("collision_lateral", t_us, lateral),
+        series("collision_rear", t_us, rear),
+        series("min_distance_to_obstacle_m", t_us, gap_m, there, "no other actor is present", keep_values=not preset.honour_valid),
+        *first,
+    ]
+
+
+def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSeries]:
+    """Give time and place of the earliest begun among the contacts of each row."""
+    t_us = rollout.ego.t_us
+    began = swept.onsets
+    order = np.lexsort((began.t_s[swept.begin], swept.step))
+    step, first = np.unique(swept.step[order], return_index=True)
+    begin = swept.begin[order][first]
+    touched = np.zeros(len(t_us), dtype=np.bool_)
+    touched[step] = True
+    x_m, y_m = in_rig(began.xy[begin], rollout).T
+    out = []
+    for name, values in (("contact_time_s", began.t_s[begin]), ("contact_x_m", x_m), ("contact_y_m", y_m)):
+        full = np.full(len(t_us), np.nan)
+        full[step] = values
+        out.append(series(name, t_us, full, touched, NO_CONTACT))
+    return out
+
+
+def in_rig(xy: F64, rollout: RolloutLog) -> F64:
+    """Return points ``(N, 2)`` of the ego's box frame in its rig frame."""
+    return np.asarray(xy @ rollout.T_rig_box[:2, :2].T + rollout.T_rig_box[:2, 3])
+
+
+FACTORY = with_preset(evaluate_collision)

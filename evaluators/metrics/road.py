@@ -1,0 +1,255 @@
+"""The road as evaluators see it: lane areas, lane centres and road edges of one map.
+
+Areas, borders and unions are built where a drive comes, and kept for the next drive.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy
+import shapely
+
+from alpasim_plugin.core.geometry import lane_polygons, ring_area
+from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
+from evaluators.metrics.border import Borders
+from evaluators.metrics.footprint import Geometries, pairs_of, spans
+from evaluators.metrics.presets import Preset
+from evaluators.metrics.surface import Surface, segment_distance
+
+LEVEL_RADIUS_M = 30.0  # AlpaSim's later rule looks no further for road edges
+_RUN = 8  # points in a row that are looked up together
+
+
+class Polylines:
+    """Segments and vertices of many polylines in 3-D, indexed in plan view."""
+
+    def __init__(self, lines: Sequence[F64], origin: F64) -> None:
+        """Take polylines ``(N, 3)``; they are held relative to an origin ``(3,)``."""
+        self.n_lines = len(lines)
+        lines = [np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in lines]
+        self.vertices = np.concatenate([np.zeros((0, 3)), *lines]) - origin
+        self.vertex_owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+        follows = np.flatnonzero(self.vertex_owner[1:] == self.vertex_owner[:-1])
+        self.start, self.end = self.vertices[follows], self.vertices[follows + 1]
+        self.owner = self.vertex_owner[follows]
+        bounds = np.searchsorted(self.owner, np.arange(self.n_lines + 1))
+        self._first, self._last = bounds[:-1], bounds[1:]  # segments of each line
+
+    @cached_property
+    def _bounds(self) -> tuple[F64, F64]:
+        """Least and greatest coordinates ``(L, 3)`` of each line."""
+        first = np.searchsorted(self.vertex_owner, np.arange(self.n_lines))
+        return np.minimum.reduceat(self.vertices, first), np.maximum.reduceat(self.vertices, first)
+
+    @cached_property
+    def _segments(self) -> Geometries:
+        return np.asarray(shapely.linestrings(np.stack([self.start[:, :2], self.end[:, :2]], axis=1)))
+
+    @cached_property
+    def _tree(self) -> shapely.STRtree:
+        return shapely.STRtree(self._segments)
+
+    def line_within(self, xyz: F64, radius_m: float) -> Bool:
+        """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D."""
+        out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
+        # Points in a row are near each other: lines, then segments are sorted out by the bounds of each run, and only then measured. The
+        # slack keeps rounding from hiding a segment.
+        run = np.arange(0, len(xyz), _RUN)
+        low, high = np.minimum.reduceat(xyz, run) - (radius_m + 1e-6), np.maximum.reduceat(xyz, run) + (radius_m + 1e-6)
+        least, most = self._bounds
+        meet = np.ones((len(run), self.n_lines), dtype=np.bool_)
+        for d in (0, 1):
+            meet &= (most[:, d] >= low[:, [d]]) & (least[:, d] <= high[:, [d]])
+        which, line = pairs_of(meet)
+        found, segment = spans(self._first[line], self._last[line])
+        which = which[found]
+        least, most = np.minimum(self.start, self.end).T, np.maximum(self.start, self.end).T
+        for d in (0, 1):
+            keep = (most[d][segment] >= low[which, d]) & (least[d][segment] <= high[which, d])
+            which, segment = which[keep], segment[keep]
+        point = (run[which, None] + np.arange(_RUN)).reshape(-1)
+        segment = np.repeat(segment, _RUN)[point < len(xyz)]
+        point = point[point < len(xyz)]
+        near = segment_distance(self.start[segment], self.end[segment], xyz[point]) <= radius_m
+        out[point[near], self.owner[segment[near]]] = True
+        return out
+
+    def vertex_within(self, xyz: F64, radius_m: float) -> Bool:
+        """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in 3-D."""
+        out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
+        if len(self.vertices):
+            found = scipy.spatial.cKDTree(self.vertices).query_ball_point(xyz, radius_m)
+            for i, vertices in enumerate(found):
+                out[i, self.vertex_owner[vertices]] = True
+        return out
+
+    def nearest_vertex_owner(self, xyz: F64) -> I64:
+        """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in 3-D."""
+        return np.asarray(self.vertex_owner[scipy.spatial.cKDTree(self.vertices).query(xyz)[1]])
+
+    def nearest_of_level(self, xyz: F64, height_m: float) -> I64:
+        """Return the nearest line ``(T,)`` at the height of each point ``(T, 3)``, -1 where there is none.
+
+        Each line with a vertex within `LEVEL_RADIUS_M` in 3-D is judged by its vertex nearest in plan view: that one must lie within
+        ``height_m`` of the point's height, and the line whose such vertex is nearest in 3-D is taken.
+        """
+        out = np.full(len(xyz), -1, dtype=np.int64)
+        start = np.concatenate([[0], np.flatnonzero(np.diff(self.vertex_owner)) + 1, [len(self.vertices)]])
+        for i, near in enumerate(self.vertex_within(xyz, LEVEL_RADIUS_M)):
+            best_m = np.inf
+            for line in np.flatnonzero(near):
+                own = self.vertices[start[line] : start[line + 1]]
+                beside = own[np.argmin(np.hypot(*(own[:, :2] - xyz[i, :2]).T))]
+                away_m = float(np.linalg.norm(beside - xyz[i]))
+                if abs(beside[2] - xyz[i, 2]) <= height_m and away_m < best_m:
+                    out[i], best_m = line, away_m
+        return out
+
+    def touched(self, footprints: Geometries, z: F64, limit_m: float, height_m: float) -> Bool:
+        """Return whether each footprint is nearer than a limit to a segment whose middle is at most ``height_m`` above or below it."""
+        out = np.zeros(len(footprints), dtype=np.bool_)
+        body, segment = self._tree.query(footprints, predicate="dwithin", distance=limit_m)
+        middle = (self.start[segment, 2] + self.end[segment, 2]) / 2
+        level = np.abs(middle - z[body]) <= height_m
+        body, segment = body[level], segment[level]
+        out[body[shapely.distance(self._segments[segment], footprints[body]) < limit_m]] = True
+        return out
+
+
+MOST_SEAM_M = 1e-4  # wider seams change the shape of gaps, not only rounding
+MOST_XY_M = 1e5  # farther from the origin, rounding comes near the seam
+
+
+class Road:
+    """Lanes and edges of one map, metres relative to ``origin``."""
+
+    def __init__(self, lane_map: LaneMap, origin: F64, preset: Preset) -> None:
+        self._lanes = tuple(lane_map.lanes.values())
+        self.origin = origin
+        self.lane_ids = tuple(lane.lane_id for lane in self._lanes)
+        self._preset = preset
+        self._centre = Polylines([lane.centre for lane in self._lanes], origin)
+        self._edges = lane_map.road_edges
+        self._areas: Geometries = np.full(len(self._lanes), None, dtype=object)
+        self._centres: Geometries = np.full(len(self._lanes), None, dtype=object)
+        self._unions: dict[bytes, Any] = {}
+        self._borders: Borders | None = None
+        self._rings = lane_map.drivable_areas
+
+    def areas(self, lane: I64) -> Geometries:
+        """Return the prepared areas ``(M,)`` of lanes ``(M,)``; a drive comes near few lanes of a map, so they are built when asked for."""
+        asked = np.zeros(len(self._lanes), dtype=np.bool_)
+        asked[lane] = True
+        new = [k for k in np.flatnonzero(asked).tolist() if self._areas[k] is None]
+        if new:
+            self._areas[new] = lane_polygons([self._lanes[k] for k in new], self.origin, self._preset.lane_half_width_m)
+            shapely.prepare(self._areas[new])
+        return np.asarray(self._areas[lane])
+
+    @cached_property
+    def edges(self) -> Geometries:
+        """Road edges in plan view, ``(E,)``."""
+        return np.array([_line(edge[:, :2] - self.origin[:2]) for edge in self._edges], dtype=object)
+
+    @cached_property
+    def _edge(self) -> Polylines:
+        return Polylines(self._edges, self.origin)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """All lanes and drivable areas as one surface."""
+        outer = [ring - self.origin for ring in self._rings]
+        rings = [ring_area(ring) for ring in outer]
+        areas = np.array([*self.areas(np.arange(len(self._lanes))), *rings], dtype=object)
+        outlines = [*(lane.centre - self.origin for lane in self._lanes), *outer]
+        return Surface(areas, outlines, self._preset.seam_m, self._preset.edge_height_m)
+
+    def lanes_near(self, xyz: F64) -> Bool:
+        """Return which lanes ``(T, L)`` pass near points ``(T, 3)``, by the preset's radius and query, in 3-D whatever their direction."""
+        if self._preset.lane_query == "vertices":
+            return self._centre.vertex_within(xyz, self._preset.lane_radius_m)
+        return self._centre.line_within(xyz, self._preset.lane_radius_m)
+
+    def union(self, lanes: Bool) -> Any:
+        """Return the prepared union of the lanes marked in ``(L,)``; kept, as unions are costly and recur along a drive."""
+        key = np.packbits(lanes).tobytes()
+        if key not in self._unions:
+            shape = join(self.areas(np.flatnonzero(lanes)), self._preset.seam_m)
+            shapely.prepare(shape)
+            self._unions[key] = shape
+        return self._unions[key]
+
+    def borders(self, sets: Bool) -> Borders | None:
+        """Return borders that know the union of each set of lanes ``(G, L)``; None where only `union` knows it.
+
+        That is where no seam is closed: rounding then decides whether lanes that share an edge are joined there.
+        """
+        if not 0 < self._preset.seam_m <= MOST_SEAM_M or float(np.abs(self._centre.vertices).max(initial=0.0)) > MOST_XY_M:
+            return None
+        if self._borders is None or not self._borders.know(sets):
+            lanes = np.flatnonzero(sets.any(axis=0))
+            self._borders = Borders(self.areas(lanes), lanes, sets, self._preset.seam_m)
+        return self._borders
+
+    def touches_edge(self, footprints: Geometries, xyz: F64) -> Bool:
+        """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the preset's threshold to the road edge.
+
+        ``edge_query`` "any": to any edge at the ego's height. "nearest_vertex": to the edge that owns the vertex nearest to the centre.
+        "nearest_of_level": to the one of `_Polylines.nearest_of_level`.
+        """
+        limit_m = self._preset.edge_touch_m
+        if self._preset.edge_query == "nearest_of_level":
+            owner = self._edge.nearest_of_level(xyz, self._preset.edge_height_m)
+            return np.asarray((owner >= 0) & (shapely.distance(self.edges[owner], footprints) < limit_m))
+        if self._preset.edge_query == "nearest_vertex":
+            return np.asarray(shapely.distance(self.edges[self._edge.nearest_vertex_owner(xyz)], footprints) < limit_m)
+        return self._edge.touched(footprints, xyz[:, 2], limit_m, self._preset.edge_height_m)
+
+    def heading_at(self, lane: I64, xy: F64) -> F64:
+        """Return the direction of lanes ``(M,)`` beside points ``(M, 2)``: from 1 cm before to 1 cm after the centre's nearest point."""
+        for k in np.unique(lane).tolist():
+            if self._centres[k] is None:
+                self._centres[k] = _line(self._lanes[k].centre[:, :2] - self.origin[:2])
+        lines = self._centres[lane]
+        s = shapely.line_locate_point(lines, shapely.points(xy))
+        before = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.maximum(s - 0.01, 0.0)))
+        after = shapely.get_coordinates(shapely.line_interpolate_point(lines, s + 0.01))
+        delta = after - before
+        return np.asarray(np.arctan2(delta[:, 1], delta[:, 0]))
+
+
+def join(areas: Geometries, seam_m: float) -> Any:
+    """Return the union of lane areas with gaps up to ``seam_m`` wide closed.
+
+    Lanes that share an edge, but not its vertices, differ there by rounding. Without closing, rounding would decide whether a footprint
+    across the edge is contained, and differently at every origin.
+    """
+    shape = areas[0] if len(areas) == 1 else shapely.union_all(areas)
+    return shapely.buffer(shape, seam_m / 2, join_style="mitre") if seam_m > 0 and len(areas) > 1 else shape
+
+
+def _line(xy: F64) -> Any:
+    return shapely.linestrings(np.repeat(xy, 2, axis=0) if len(xy) == 1 else xy)
+
+
+_cache: dict[tuple[int, bytes, Preset], tuple[weakref.ref[LaneMap], Road]] = {}
+_CACHED_ROADS = 8
+
+
+def road_of(lane_map: LaneMap, origin: F64, preset: Preset) -> Road:
+    """Return the prepared road of a map; the last few are kept, as rollouts of one scene come in a row."""
+    key = (id(lane_map), origin.tobytes(), preset)
+    held = _cache.get(key)
+    # An id can be reused after its object is gone; the weak reference shows that.
+    if held is not None and held[0]() is lane_map:
+        return held[1]
+    while len(_cache) >= _CACHED_ROADS:
+        del _cache[next(iter(_cache))]
+    road = Road(lane_map, origin, preset)
+    _cache[key] = (weakref.ref(lane_map), road)
+    return road

@@ -1,0 +1,205 @@
+"""The drive against the recorded one: distance from its path, from its position at the time, and progress along it.
+
+Beyond the ends of that path the lateral distance is measured from its straight continuation: driving on is no error.
+
+The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved to the box centre with the log's
+rig-to-box pose. All distances are in plan view. The paper's route distance is the mean over the scored steps of the distance to that path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.core.geometry import arc_lengths, interpolate, offset_trajectory
+from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
+from evaluators.metrics.footprint import ego_footprints, held, origin_of
+from evaluators.metrics.presets import PRESETS, Preset
+from evaluators.metrics.score import relevant, series, with_preset
+
+DIRECTION_M = 1.0
+_ROWS = 32  # points handled at once, so that what is computed of them stays in the processor's cache
+
+
+def recorded_path(rollout: RolloutLog, preset: Preset) -> Trajectory:
+    """Return the recorded drive as poses of the box centre."""
+    path = offset_trajectory(rollout.ego_log, rollout.T_rig_box)
+    return replace(path, xyz=held(path.xyz, preset))
+
+
+def to_path(path: F64, points: F64) -> tuple[F64, F64]:
+    """Project points on a polyline.
+
+    Args:
+        path: ``(N, 2)`` vertices; one vertex is a point.
+        points: ``(T, 2)``.
+
+    Returns:
+        Distances ``(T,)`` and arc lengths ``(T,)`` of the nearest point of the path; of several nearest ones the first.
+    """
+    line = shapely.linestrings(np.repeat(path, 2, axis=0) if len(path) == 1 else path)
+    at = shapely.points(points)
+    return np.asarray(shapely.distance(line, at)), np.asarray(shapely.line_locate_point(line, at))
+
+
+def left_of(path: F64, s: F64, points: F64) -> F64:
+    """Return ``(T,)`` +1 where a point lies left of the path, -1 right of it, 0 on it, NaN where the path has no length.
+
+    Args:
+        path: ``(N, 2)`` vertices.
+        s: ``(T,)`` arc length of the nearest point of the path.
+        points: ``(T, 2)``.
+
+    At a corner the direction is that of the segment which the nearest point ends.
+    """
+    at = arc_lengths(path)
+    steps = np.diff(path, axis=0)
+    long = np.flatnonzero(np.diff(at) > 0)
+    if not len(long):
+        return np.full(len(points), np.nan)
+    segment = long[np.clip(np.searchsorted(at[long + 1], s), 0, len(long) - 1)]
+    offset = points - path[segment]
+    along = steps[segment]
+    return np.asarray(np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]))
+
+
+def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
+    """Return ``(T,)`` the distance of points from a path that goes straight on at both ends, NaN where the path has no direction.
+
+    Args:
+        path: ``(N, 2)`` vertices.
+        s: ``(T,)`` arc length of the nearest point of the path.
+        points: ``(T, 2)``.
+        distance_m: ``(T,)`` distance from the path itself.
+
+    The direction at an end is that of the path's last `DIRECTION_M` metres: a recording that stops leaves vertices too near for one.
+    """
+    at = arc_lengths(path)
+    length_m = float(at[-1])
+    if length_m < DIRECTION_M:
+        return np.full(len(points), np.nan)
+    out = np.array(distance_m)
+    inner = (np.interp(DIRECTION_M, at, path[:, 0]), np.interp(DIRECTION_M, at, path[:, 1]))
+    outer = tuple(np.interp(length_m - DIRECTION_M, at, path[:, axis]) for axis in (0, 1))
+    for end, inside, is_there in ((path[0], inner, s <= 0.0), (path[-1], outer, s >= length_m * (1 - 1e-12))):
+        away = end - np.asarray(inside)
+        away = away / np.hypot(*away)
+        offset = points - end
+        beyond = is_there & (offset @ away > 0.0)
+        out[beyond] = np.abs(away[0] * offset[beyond, 1] - away[1] * offset[beyond, 0])
+    return out
+
+
+def from_corridor(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
+    """Return ``(T,)`` the distance of points from a path that goes straight on at its far end only, along its last segment.
+
+    AlpaSim's later rule; `beside` is ours. Arguments as there.
+    """
+    out = np.array(distance_m)
+    length_m = float(arc_lengths(path)[-1])
+    along = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
+    if length_m > 0 and np.hypot(*along) > 0:
+        beyond = s >= length_m - 1e-9
+        offset = points[beyond] - path[-1]
+        out[beyond] = np.abs(offset[:, 0] * along[1] - offset[:, 1] * along[0]) / np.hypot(*along)
+    return out
+
+
+def progress_so_far(path: F64, points: F64) -> F64:
+    """Return ``(T,)`` how far point k has come along the first k + 1 vertices of a path, as a share of their length.
+
+    Args:
+        path: ``(T, 2)`` where the recording is at each step.
+        points: ``(T, 2)`` where the ego is.
+
+    1 where that part of the path has no length: the recording has not moved, so there is nothing to be behind of.
+    """
+    n = len(path)
+    s = arc_lengths(path)
+    if n == 1:
+        return np.ones(1)
+    (x, y), (along_x, along_y) = path[:-1].T, np.diff(path, axis=0).T
+    length2 = along_x**2 + along_y**2
+    over = np.where(length2 > 0, length2, np.inf)  # a segment without length is its start
+    out = np.ones(n)
+    for low in range(1, n, _ROWS):
+        rows = np.arange(low, min(low + _ROWS, n))
+        there = slice(0, int(rows[-1]))  # segments that start at or after vertex k do not exist yet for point k
+        to_x, to_y = points[rows, :1] - x[there], points[rows, 1:] - y[there]  # (R, S)
+        f = np.clip((to_x * along_x[there] + to_y * along_y[there]) / over[there], 0.0, 1.0)
+        to_x -= f * along_x[there]
+        to_y -= f * along_y[there]
+        distance2 = to_x**2 + to_y**2
+        distance2[np.arange(rows[-1])[None] >= rows[:, None]] = np.inf
+        best = np.argmin(distance2, axis=1)
+        reached = s[best] + f[np.arange(len(rows)), best] * np.sqrt(length2[best])
+        total = s[rows]
+        out[rows] = np.divide(reached, total, out=np.ones(len(rows)), where=total > 0)
+    return out
+
+
+def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> list[MetricSeries]:
+    """Give the recording-based metrics and ``eval_relevant`` per step."""
+    t_us = rollout.ego.t_us
+    origin = origin_of(rollout.ego_log, preset)
+    recorded = recorded_path(rollout, preset)
+    path = recorded.xyz[:, :2] - origin[:2]
+    ego = ego_footprints(rollout, preset, origin).centres()
+    distance_m, s = to_path(path, ego)
+    length_m = float(arc_lengths(path)[-1])
+    covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
+    there = held(interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3], preset)[:, :2] - origin[:2]
+    away_m = np.hypot(*(ego - there).T)
+    share = s / length_m if length_m > 0 else np.full(len(s), np.nan)
+    no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
+    no_length = "the recorded path has no length"
+    outside = "the recording does not cover this time"
+    aside_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
+    engaged = relevant(rollout)
+    so_far = progress_so_far(there, ego)
+    driven_m = arc_lengths(ego)
+    first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
+    traveled_m = np.maximum(driven_m - driven_m[first], 0.0)
+    if preset.invented_starts:
+        # AlpaSim fills the first two rows in by hand, and projects the ego on its own path instead of adding up its steps.
+        traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
+        share[:2] = [0.0, share[2] / 2] if len(share) > 2 else 0.0
+        so_far[:2] = 1.0
+        for column in (distance_m, away_m, traveled_m, *(() if aside_m is None else (aside_m,))):
+            column[:2] = 0.0
+    out = [
+        series("dist_to_gt_trajectory", t_us, distance_m),
+        series("dist_to_gt_location", t_us, away_m, covered, outside),
+        series("progress", t_us, share, length_m > 0, no_length),
+        series("progress_rel", t_us, so_far, covered, outside),
+        series("dist_traveled_m", t_us, traveled_m),
+        series("gt_dist_traveled_m", t_us, np.full(len(t_us), length_m)),
+        series("eval_relevant", t_us, engaged),
+    ]
+    if preset.aliases:
+        if aside_m is not None and preset.stop_beyond_gt_m is not None:
+            out.append(series("lateral_dist_to_gt_trajectory", t_us, aside_m))
+            out.append(series("left_corridor_laterally", t_us, aside_m >= preset.stop_beyond_gt_m))
+        if preset.progress_of == "reachable" and length_m > 0:
+            reached_m = float(to_path(path, there[-1:])[1][0])
+            share = share * (length_m / reached_m if reached_m > 0 else 1.0)
+        return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
+    aside_m = beside(path, s, ego, distance_m)
+    has_side = np.isfinite(aside_m)
+    return [
+        *out,
+        series("lateral_distance_m", t_us, aside_m, has_side, no_direction),
+        series("route_distance_m", t_us, distance_m),
+        series("lateral_bias_m", t_us, left_of(path, s, ego) * aside_m, has_side, no_direction),
+    ]
+
+
+def lateral_bias(rollout: RolloutLog) -> MetricSeries:
+    """Return ``lateral_bias_m`` of a rollout, for tables of presets whose metrics do not have it, such as ``alpasim``."""
+    # The map plays no part in it.
+    return next(one for one in evaluate_route(rollout, None, PRESETS["paper"]) if one.name == "lateral_bias_m")
+
+
+FACTORY = with_preset(evaluate_route)

@@ -1,0 +1,337 @@
+"""Run folders, also unfinished or damaged ones: described by ``run.json`` and ``summary.json``, found below a folder, and chosen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.checksums import read_sealed
+from alpasim_plugin.io.lock import holder_of
+from alpasim_plugin.io.reading.files import as_shape, read_json_as
+from alpasim_plugin.run_folder.schema import CONTENTS, LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
+from alpasim_plugin.run_folder.shapes import RunInfo, Summary
+from evaluators.metrics import MetricTable
+
+DOING = "listing runs"
+CHECK = "simrun check RUN says what is damaged"
+
+State = Literal["finished", "running", "unfinished", "damaged"]
+STATES: tuple[State, ...] = get_args(State)
+
+
+@dataclass(frozen=True)
+class RunEntry:
+    """A run folder in a list.
+
+    Attributes:
+        folder: Its path, as found.
+        state: ``finished``; ``running`` where a process writes it; ``unfinished`` where none does any more; ``damaged`` where it cannot be
+            read.
+        problem: Why it is damaged, else empty.
+        info: ``run.json``, or its copy in ``contents.json`` where it is damaged; empty where there is neither.
+    """
+
+    folder: Path
+    state: State
+    problem: str
+    info: Mapping[str, Any]
+
+    @cached_property
+    def table(self) -> MetricTable:
+        """Give what the run's metrics are, as the run itself says."""
+        return MetricTable.of_run(self.info)
+
+    @property
+    def kind(self) -> str:
+        """Give what the folder holds: ``run``, ``score`` (of logs) or ``fork``."""
+        return str(self.info.get("kind") or "run")
+
+    @property
+    def started_at(self) -> datetime | None:
+        """Give when the run was begun."""
+        return as_time(self.info.get("started_at"))
+
+    @property
+    def project(self) -> Mapping[str, Any]:
+        """Give what `alpasim_plugin.runtime.provenance.Project` names; empty for a run of an earlier version."""
+        return self.info.get("project") or {}
+
+    @property
+    def commit(self) -> str:
+        """Give the project's commit, or ""."""
+        return str(self.project.get("commit") or "")
+
+    @property
+    def commit_text(self) -> str:
+        """Give the commit for a table: seven digits, and ``+`` where files differed from it; "" without one."""
+        return self.commit[:7] + ("+" if self.commit and self.project.get("dirty") else "")
+
+    @property
+    def weights(self) -> frozenset[tuple[str, str]]:
+        """Give name of a weight file and its SHA-256; where the file lay does not matter."""
+        return frozenset((Path(path).name, str(digest)) for path, digest in (self.info.get("weights") or {}).items())
+
+    @property
+    def scenes(self) -> dict[str, str]:
+        """Give scene id -> content hash."""
+        return {name: str(facts.get("content_hash") or "") for name, facts in (self.info.get("scenes") or {}).items()}
+
+    @property
+    def outcome(self) -> Mapping[str, Any]:
+        """Give ``n_rollouts`` and ``n_failed``, from ``run.json`` or, for a run of an earlier version, from the summary; else empty."""
+        if self.state != "finished":
+            return {}
+        stated: Mapping[str, Any] = self.info.get("outcome") or self.summary.get("failures") or {}
+        return stated
+
+    @property
+    def planned(self) -> int | None:
+        """Give how many rollouts were planned; None for scored logs that are not finished, and without ``run.json``."""
+        if "n_rollouts" in self.outcome:
+            return int(self.outcome["n_rollouts"])
+        if not self.info or self.kind == "score":
+            return None
+        sizes = [len(self.info.get(name) or ()) for name in ("renderers", "policies", "scenes", "seeds")]
+        return sizes[0] * sizes[1] * sizes[2] * sizes[3]
+
+    @cached_property
+    def summary(self) -> Mapping[str, Any]:
+        """Give ``summary.json``, read on first use; empty where the run is not finished.
+
+        Raises:
+            InputError: A finished run without a readable one.
+        """
+        if self.state != "finished":
+            return {}
+        summary: Mapping[str, Any] = read_json_as(Summary, self.folder / SUMMARY, DOING, do_this=CHECK)
+        return summary
+
+    def metric(self, metric: str, renderer: str, policy: str) -> Mapping[str, Any]:
+        """Return the entry of a metric in ``summary.json``; empty where it has none."""
+        table = self.summary.get("metrics") or {}
+        of = table.get(cell_name(renderer, policy)) or (table.get(renderer) if len(self.info.get("policies") or ()) == 1 else None) or {}
+        return of.get(metric) or {}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything for JSON."""
+        info = self.info
+        listed = {name: list(info.get(name) or ()) for name in ("renderers", "policies", "seeds", "asked")}
+        return {
+            "folder": str(self.folder), "state": self.state, "problem": self.problem, "kind": self.kind, "key": info.get("key"),
+            "started_at": info.get("started_at"), "project": dict(self.project) or None, "version": info.get("version"),
+            "preset": info.get("preset"), **listed, "scenes": self.scenes, "weights": dict(info.get("weights") or {}),
+            "rollouts": self.planned, "failed": self.outcome.get("n_failed"),
+        }  # fmt: skip
+
+
+def as_time(text: object) -> datetime | None:
+    """Return a time of ISO 8601, in UTC where it names no zone; None where it is no time."""
+    try:
+        found = datetime.fromisoformat(str(text))
+    except ValueError:
+        return None
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+
+def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
+    """Describe a run folder; what is wrong with it is part of the description.
+
+    Args:
+        folder: The run folder.
+        with_summary: Read ``summary.json`` too, so that damage of it is noticed here; its size makes it five times slower.
+    """
+    finished = os.path.isfile(folder / CONTENTS)  # False too where the folder may not be looked into
+    info: Mapping[str, Any] = {}
+    problem = ""
+    try:
+        info = _run_info(folder / RUN_INFO, is_copy=False)
+    except InputError as error:
+        problem = f"{RUN_INFO}: {error.found}"
+        with suppress(InputError):  # the copy may be damaged too
+            info = _run_info(folder / CONTENTS, is_copy=True) if finished else info
+    if problem or not finished:
+        if holder_of(folder / LOCK) is not None:
+            return RunEntry(folder, "running", "", info)
+        return RunEntry(folder, "damaged" if problem else "unfinished", problem, info)
+    lost = [name for name in (SUMMARY, ROLLOUTS) if not os.path.isfile(folder / name)]
+    if lost:
+        return RunEntry(folder, "damaged", f"{lost[0]}: missing", info)
+    entry = RunEntry(folder, "finished", "", info)
+    try:
+        if with_summary or "outcome" not in info:
+            entry.summary  # noqa: B018 - read now, so that damage is a fact of the entry
+    except InputError as error:
+        return RunEntry(folder, "damaged", f"{SUMMARY}: {error.found}", info)
+    return entry
+
+
+def _run_info(path: Path, is_copy: bool) -> Mapping[str, Any]:
+    content, _ = read_sealed(path, DOING, CHECK)
+    shaped: Mapping[str, Any] = as_shape(RunInfo, (content.get("run") or {}) if is_copy else content, path, DOING, CHECK)
+    return shaped
+
+
+MARKS = frozenset((RUN_INFO, CONTENTS, LOCK))  # the first file of a run folder is its lock
+SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
+
+
+def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntry]:
+    """Describe every run folder below some folders, or those folders themselves, the newest first.
+
+    A folder that a killed run left behind is one too. Nothing is searched inside a run folder, so forks inside a run are part of it.
+
+    Args:
+        roots: Folders; one that is reached twice is listed once.
+        with_summary: As for `read_entry`.
+
+    Raises:
+        InputError: A root is not a folder.
+    """
+    found: dict[tuple[int, int], Path] = {}
+    for root in roots:
+        if not root.is_dir():
+            what = "a file" if root.exists() else "no such folder"
+            raise InputError(DOING, str(root), what, "name the folder that holds the run folders; simrun run writes them below runs/")
+        for folder in _run_folders(root, set()):
+            state = folder.stat()
+            found.setdefault((state.st_dev, state.st_ino), folder)
+
+    def newest_first(entry: RunEntry) -> tuple[float, str]:
+        """Sort by start; a folder that does not say when it was begun comes last."""
+        began = entry.started_at
+        return (-began.timestamp() if began is not None else float("inf"), str(entry.folder))
+
+    return sorted((read_entry(folder, with_summary) for folder in found.values()), key=newest_first)
+
+
+def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
+    """Yield the run folders below a folder, in the order of names; links are followed, circles are not."""
+    state = folder.stat()
+    if (state.st_dev, state.st_ino) in seen:
+        return
+    seen.add((state.st_dev, state.st_ino))
+    try:
+        with os.scandir(folder) as scanned:
+            entries = sorted(scanned, key=lambda entry: entry.name)
+    except PermissionError:
+        yield folder  # it may be one: listed as what cannot be read
+        return
+    if any(entry.name in MARKS for entry in entries):
+        yield folder
+        return
+    for entry in entries:
+        if not entry.name.startswith(".") and entry.name not in SKIPPED and entry.is_dir():
+            yield from _run_folders(Path(entry.path), seen)
+
+
+LEAST_DIGITS = 4  # of a commit or a digest: fewer name anything
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a run must be; an empty member asks for nothing. Names may hold ``*`` and ``?``.
+
+    Attributes:
+        commits: Beginnings of the project's commit.
+        weights: Beginnings of the SHA-256 of a weight file, or names of the file.
+        renderers: The run has a renderer that each of these names.
+        policies: Likewise.
+        scenes: Likewise; a scene's id, or what the command named: a suite, a folder, a file.
+        presets: One of them.
+        states: One of them.
+        since: Begun at or after.
+        until: Begun before.
+    """
+
+    commits: tuple[str, ...] = ()
+    weights: tuple[str, ...] = ()
+    renderers: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
+    presets: tuple[str, ...] = ()
+    states: tuple[State, ...] = ()
+    since: datetime | None = None
+    until: datetime | None = None
+
+    def __post_init__(self) -> None:
+        for one in (*self.commits, *self.weights):
+            if len(one) < LEAST_DIGITS:
+                raise InputError(DOING, f"--commit or --weights {one!r}", "too short", f"give at least {LEAST_DIGITS} characters")
+
+    def takes(self, entry: RunEntry) -> bool:
+        """Tell whether a run is all that is asked for."""
+        info, began = entry.info, entry.started_at
+        named = [*entry.scenes, *map(str, info.get("asked") or ())]
+        return (
+            _any_begins(self.commits, [entry.commit])
+            and _any_begins(self.weights, [text for pair in entry.weights for text in pair])
+            and _each_is_named(self.renderers, info.get("renderers") or ())
+            and _each_is_named(self.policies, info.get("policies") or ())
+            and _each_is_named([_scene(one) for one in self.scenes], [_scene(one) for one in named])
+            and (not self.presets or info.get("preset") in self.presets)
+            and (not self.states or entry.state in self.states)
+            and (self.since is None or (began is not None and began >= self.since))
+            and (self.until is None or (began is not None and began < self.until))
+        )
+
+
+def chosen(entries: Iterable[RunEntry], choice: Choice) -> tuple[list[RunEntry], list[RunEntry]]:
+    """Split runs into those that a choice takes, and those of the rest whose ``run.json`` is lost, so that nothing can be asked of them."""
+    taken, lost = [], []
+    for entry in entries:
+        if choice.takes(entry):
+            taken.append(entry)
+        elif not entry.info and (not choice.states or entry.state in choice.states):
+            lost.append(entry)
+    return taken, lost
+
+
+def _any_begins(asked: Sequence[str], texts: Iterable[str]) -> bool:
+    known = [text.lower() for text in texts]
+    return not asked or any(text.startswith(one.lower()) for one in asked for text in known)
+
+
+def _each_is_named(asked: Sequence[str], known: Sequence[str]) -> bool:
+    return all(any(fnmatchcase(name, one) for name in known) for one in asked)
+
+
+def _scene(name: str) -> str:
+    """Spell a scene or a suite one way: ``smoke/curve`` has the id ``smoke-curve``, and a suite's file ends with .yaml."""
+    return name.removesuffix(".yaml").replace("/", "-").removeprefix("suites-")
+
+
+def as_day(text: str, option: str, now: datetime) -> datetime:
+    """Read a date, a time, or an age such as ``7d`` or ``12h``; without a zone it is UTC, as in ``run.json``.
+
+    Example:
+        >>> as_day("2d", "--since", datetime(2026, 3, 10, 12, tzinfo=UTC)).isoformat()
+        '2026-03-08T12:00:00+00:00'
+        >>> as_day("2026-03-01", "--since", datetime(2026, 3, 10, tzinfo=UTC)).isoformat()
+        '2026-03-01T00:00:00+00:00'
+
+    Raises:
+        InputError: None of these.
+    """
+    hours = {"h": 1, "d": 24, "w": 168}.get(text[-1:])
+    try:
+        if hours is not None:
+            return now - timedelta(hours=hours * float(text[:-1]))
+        found = datetime.fromisoformat(text)
+    except (ValueError, OverflowError):
+        raise InputError(DOING, f"{option} {text}", "neither a date nor an age", "write 2026-03-01, 2026-03-01T18:00, 7d or 12h") from None
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+
+def shown_folder(folder: Path, roots: Sequence[Path]) -> str:
+    """Return a folder's path below the root that it was found in, where there is one root, else as it was found."""
+    if len(roots) == 1 and folder != roots[0] and folder.is_relative_to(roots[0]):
+        return folder.relative_to(roots[0]).as_posix()
+    return str(folder)

@@ -1,0 +1,285 @@
+"""The gate: margins, limits and the least amount of data as YAML (docs/ci.md); its verdict on a run, and the outcome that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.io.config import load_yaml, validate
+from alpasim_plugin.io.yaml_positions import Document
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.sides import Row, Side, by_renderer, failure_of, is_ok
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.metrics.presets import PRESETS
+from evaluators.statistics.baselines import of_policy, policies_of
+from evaluators.statistics.paired import compare
+from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, worst
+
+DOING = "reading a gate"
+LIBRARY = Path(__file__).resolve().parents[2] / "configs" / "gates"
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MetricRule(_Strict):
+    """What one metric must meet: a margin on the paired difference, limits on the mean, or both."""
+
+    margin: float | None = Field(default=None, ge=0.0, description="How much worse is accepted (without a better side: either way).")
+    max: float | None = Field(default=None, description="Largest mean accepted.")
+    min: float | None = Field(default=None, description="Smallest mean accepted.")
+    must_decide: bool = Field(default=True, description="Undecided fails the gate with code 3; false: only worse does.")
+
+    @model_validator(mode="after")
+    def _says_something(self) -> MetricRule:
+        if self.margin is None and self.max is None and self.min is None:
+            raise ValueError("a rule without margin, max or min | add one of them, or remove the metric")
+        return self
+
+
+class GateSpec(_Strict):
+    """A gate file."""
+
+    version: Literal[1] = Field(description="Version of this schema: 1.")
+    description: str = Field(default="", description="One sentence for people.")
+    preset: str | None = Field(default=None, description="Evaluator preset that the run must have been scored with.")
+    baseline: str | None = Field(
+        default=None, description="Renderer to compare with; none: the run's first, or the same name in the stored baseline."
+    )
+    renderers: tuple[str, ...] = Field(default=(), description="Renderers to judge; none: all but the baseline.")
+    min_scenes: int = Field(default=2, ge=2, description="Fewest scenes with a pair that a paired verdict may stand on.")
+    max_failed: float = Field(default=0.0, ge=0.0, lt=1.0, description="Share of rollouts that may fail to run.")
+    max_missing: float = Field(default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric.")
+    metrics: dict[str, MetricRule] = Field(min_length=1, description="Metric to rule.")
+
+
+def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[GateSpec, str]:
+    """Read a gate file, or a shipped gate by name (``default``).
+
+    Args:
+        path_or_name: The file or the name.
+        known: The metrics that it may name: those of the run that it judges.
+
+    Returns:
+        The gate and the file it came from.
+
+    Raises:
+        InputError: No such file, bad YAML, an unknown key, metric or preset: with file, line and column.
+    """
+    shipped = LIBRARY / f"{path_or_name}.yaml"
+    path = next((one for one in (Path(path_or_name), shipped) if one.is_file()), None)
+    if path is None:
+        raise InputError(DOING, str(path_or_name), "no such file", f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}")
+    document = load_yaml(path, DOING)
+    spec = validate(GateSpec, document, DOING)
+    _check_names(spec, document, known)
+    return spec, str(path)
+
+
+def shipped_gates() -> list[str]:
+    """Return the names of the gates that come with the package."""
+    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+
+
+def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None:
+    for name, rule in spec.metrics.items():
+        try:
+            facts = known.info(name)
+        except EvaluatorError as error:
+            raise document.error(DOING, ("metrics", name), f"no metric {name!r}", "simrun list metrics prints the known ones") from error
+        if rule.margin == 0.0 and facts.direction == "none":
+            found = f"a margin of 0 for {name!r}, which has no better side"
+            raise document.error(DOING, ("metrics", name), found, "give the change to either side that is accepted")
+    if spec.preset is not None and spec.preset not in PRESETS:
+        raise document.error(DOING, ("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")
+
+
+Kind = Literal["margin", "limit"]
+Sides = Mapping[str, Side]  # RENDERER -> its rollouts
+
+
+@dataclass(frozen=True)
+class Check:
+    """One metric of one renderer and policy against one rule."""
+
+    renderer: str
+    policy: str
+    metric: str
+    kind: Kind
+    cause: Cause
+    text: str  # one sentence with the numbers
+    entry: Mapping[str, Any]  # the paired comparison, or mean and bounds
+    binding: bool = True  # an undecided check that does not bind leaves the gate open
+
+
+@dataclass(frozen=True)
+class GateVerdict:
+    """Everything a gate found; `outcome` gives the exit code and the heading."""
+
+    outcome: Outcome
+    checks: tuple[Check, ...]
+    failures: Mapping[str, Any]
+    baseline: str  # what was compared with, in words
+
+    @property
+    def exit_code(self) -> int:
+        """Give the process exit code."""
+        return self.outcome.exit_code
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        checks = [asdict(check) for check in self.checks]
+        return {"outcome": self.outcome.as_dict(), "baseline": self.baseline, "failures": dict(self.failures), "checks": checks}
+
+
+def judge(
+    rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "", known: MetricTable = METRICS
+) -> GateVerdict:
+    """Judge rollout rows.
+
+    Args:
+        rows: Every planned rollout of the run (`rows_of_run`).
+        spec: The gate.
+        stored: Rows of a stored baseline; without it the baseline is a renderer of the run itself.
+        stored_name: How to call the stored baseline.
+        known: What the metrics are.
+
+    Raises:
+        InputError: A renderer that the gate names is not there, or nothing is left to judge.
+    """
+    return judge_sides(_sides(rows), failures_of(rows), spec, None if stored is None else _sides(stored), stored_name, known)
+
+
+def judge_table(
+    table: RolloutTable, spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "", known: MetricTable = METRICS
+) -> GateVerdict:
+    """Judge rollouts in columns; see `judge`."""
+    by_class = table.failures()
+    failures = {"n_rollouts": table.n_rollouts, "n_failed": sum(by_class.values()), "by_class": by_class}
+    sides = {policy: table.sides(policy) for policy in table.policies}
+    return judge_sides(sides, failures, spec, None if stored is None else _sides(stored), stored_name, known)
+
+
+def judge_sides(
+    sides: Mapping[str, Sides],
+    failures: Mapping[str, Any],
+    spec: GateSpec,
+    stored: Mapping[str, Sides] | None,
+    stored_name: str,
+    known: MetricTable = METRICS,
+) -> GateVerdict:
+    """Judge rollouts that are laid out by cell; see `judge`.
+
+    Args:
+        sides: POLICY -> RENDERER -> its rollouts, in order of appearance.
+        failures: As `failures_of` gives them.
+        spec, stored_name, known: As for `judge`.
+        stored: The same of a stored baseline.
+    """
+    checks: list[Check] = []
+    for policy, here in sides.items():
+        there = here if stored is None else stored.get(policy, {})
+        for renderer in _judged(here, spec, stored is not None):
+            base = spec.baseline or (renderer if stored is not None else next(iter(here)))
+            if base not in there and any(rule.margin is not None for rule in spec.metrics.values()):
+                where = "the stored baseline" if stored is not None else "the run"
+                others = ", ".join(there) or "no rollout of this policy"
+                raise InputError("judging a run", f"baseline {base!r}", f"{where} does not have it", f"choose one of: {others}")
+            for name, rule in spec.metrics.items():
+                metric, side = known.info(name), here[renderer]
+                if rule.margin is not None:
+                    checks.append(_margin(side, there[base], (renderer, policy), base, metric, rule, spec))
+                if rule.max is not None or rule.min is not None:
+                    checks.append(_limit(side, (renderer, policy), metric, rule))
+    found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
+    outcome = worst([outcome_of_failures(failures, spec.max_failed), *found])
+    first = next(iter(next(iter(sides.values()))))
+    name = stored_name if stored is not None else f"renderer {spec.baseline or first} of the same run"
+    return GateVerdict(outcome, tuple(checks), failures, name)
+
+
+def _sides(rows: Sequence[Row]) -> dict[str, Sides]:
+    return {policy: by_renderer(of_policy(rows, policy)) for policy in policies_of(rows)}
+
+
+def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """Count rollouts that did not run to their end, as summary.json does."""
+    by_class: dict[str, int] = {}
+    for row in rows:
+        if not is_ok(row):
+            by_class[failure_of(row)] = by_class.get(failure_of(row), 0) + 1
+    return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
+
+
+def _judged(here: Sides, spec: GateSpec, has_stored: bool) -> list[str]:
+    absent = [name for name in spec.renderers if name not in here]
+    if absent:
+        raise InputError("judging a run", f"renderers {absent}", "the run has none of these", f"it has {', '.join(here)}")
+    if spec.renderers:
+        return list(spec.renderers)
+    if has_stored and spec.baseline is None:
+        return list(here)
+    base = spec.baseline or next(iter(here))
+    judged = [name for name in here if name != base]
+    if not judged and any(rule.margin is not None for rule in spec.metrics.values()):
+        do = "run two renderers, or give --baseline-file"
+        raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", do)
+    return judged or [base]  # a gate of limits alone needs no second renderer
+
+
+def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec) -> Check:
+    entry = compare(side, base, metric, name, rule.margin or 0.0)
+    planned = entry["n_cells"] + entry["n_missing"]
+    cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
+    said = _paired_text(entry, metric.name, variant[0])
+    if entry["n_scenes"] < spec.min_scenes:
+        cause = "undecided"
+        said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
+    elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
+        cause = "undecided"
+        said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
+    return Check(*variant, metric.name, "margin", cause, said, entry, rule.must_decide)
+
+
+def _limit(side: Side, variant: tuple[str, str], metric: MetricInfo, rule: MetricRule) -> Check:
+    values = side.values(metric.name)
+    known = values[np.isfinite(values)]
+    bounds = {"max": rule.max, "min": rule.min}
+    limits = " and ".join(f"{kind} {value:g}" for kind, value in bounds.items() if value is not None)
+    if not len(known):
+        text = f"{variant[0]}: {metric.name} has no valid value, its limit is {limits}"
+        return Check(*variant, metric.name, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
+    mean = float(known.mean())
+    broken = (rule.max is not None and mean > rule.max) or (rule.min is not None and mean < rule.min)
+    text = f"{variant[0]}: {metric.name} {_number(mean, metric.unit)}, limit {limits}"
+    return Check(
+        *variant, metric.name, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)}
+    )
+
+
+def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str) -> str:
+    unit = entry["unit"]
+    head = f"{renderer}: {metric}"
+    if entry["diff"] is None:
+        return f"{head} cannot be compared with {entry['baseline']}: {entry['reason']}"
+    text = f"{head} {_number(entry['diff'], unit, sign=True)} against {entry['baseline']}"
+    if entry["ci95"] is None:
+        return f"{text}: {entry['reason']}"
+    low, high = (_number(b, unit, sign=True) for b in entry["ci95"])
+    text += f" (95 % {low} to {high}, margin {_number(entry['margin'], unit)}): {entry['verdict']}"
+    if entry["verdict"] == "undecided":
+        more = entry["more_scenes"]
+        text += f", about {more} more scenes would decide it" if more else ", more scenes of this kind would not decide it"
+    return text
+
+
+def _number(value: float, unit: str, sign: bool = False) -> str:
+    text = f"{value:+.4g}" if sign else f"{value:.4g}"
+    return f"{text} {unit}".rstrip()

@@ -1,0 +1,256 @@
+"""Intervals of a mean over rollouts, at 95 %.
+
+`normal_half_width` is the paper's formula. It treats the seeds of one scene as independent, which makes it too short where scenes differ;
+`clustered` takes the scene as the unit. A quantity that does not exist is None and comes with a reason. The measured
+coverage of each is in docs/experiments/interval-coverage.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import scipy  # its submodules load on first use; scipy.stats would take a second
+
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.types import F64, I64
+
+Z95 = 1.96
+LEVEL = 0.95
+TAIL = (1 - LEVEL) / 2
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A centre with bounds; bounds are None where they do not exist, and ``reason`` then says why. ``note`` qualifies bounds that exist."""
+
+    centre: float
+    low: float | None = None
+    high: float | None = None
+    reason: str = ""
+    note: str = ""
+    method: str = ""
+
+    @property
+    def bounds(self) -> list[float] | None:
+        """Give [low, high] or None."""
+        return None if self.low is None or self.high is None else [self.low, self.high]
+
+
+def within(interval: Interval, low: float, high: float) -> Interval:
+    """Cut an interval to the values that are possible; what it covers does not change, since nothing true lies outside.
+
+    Example:
+        >>> within(Interval(0.97, 0.66, 1.28), 0.0, 1.0).bounds
+        [0.66, 1.0]
+    """
+    if interval.low is None or interval.high is None:
+        return interval
+    return replace(interval, low=min(max(interval.low, low), high), high=max(min(interval.high, high), low))
+
+
+def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
+    """Return 1.96 s / sqrt(N) with the sample standard deviation s of ``(N,)`` values (paper, appendix), and why it is missing.
+
+    Example:
+        >>> round(normal_half_width([0.0, 0.0, 1.0, 1.0])[0], 4)
+        0.5658
+        >>> normal_half_width([1.0])
+        (None, 'one rollout has no spread')
+    """
+    x = np.asarray(values, dtype=np.float64)
+    if len(x) < 2:
+        return None, "one rollout has no spread"
+    return Z95 * float(np.std(x, ddof=1)) / float(np.sqrt(len(x))), ""
+
+
+def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
+    """Return mean and t interval of independent ``(n,)`` values.
+
+    Example:
+        >>> one = t_interval([1.0, 2.0, 3.0])
+        >>> round(one.low, 4), round(one.high, 4)
+        (-0.4841, 4.4841)
+    """
+    x = np.asarray(values, dtype=np.float64)
+    centre = float(np.mean(x))
+    if len(x) < 2:
+        return Interval(centre, reason=f"needs at least two {what}, found {len(x)}")
+    low, high = t_bounds(x)
+    note = f"all {len(x)} {what} are equal: the interval has no width" if low == high else ""
+    return Interval(centre, float(low), float(high), note=note, method=f"t on {what}")
+
+
+def t_bounds(means: F64) -> tuple[F64, F64]:
+    """Return the t bounds ``(...,)`` of the mean over the last axis of ``(..., G)`` independent values."""
+    n = means.shape[-1]
+    centre = means.mean(axis=-1)
+    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * means.std(axis=-1, ddof=1) / np.sqrt(n)
+    return np.asarray(centre - half), np.asarray(centre + half)
+
+
+def logit_t_bounds(means: F64) -> tuple[F64, F64]:
+    """Return bounds ``(...,)`` of a rate from the rates ``(..., G)`` of G scenes, always within [0, 1].
+
+    The t interval is taken on logit(p), with the standard error of the scene means divided by p (1 - p) (delta method; the logit interval
+    of survey statistics, with scenes as sampling units). Where the scenes do not differ there is no spread to go by: the bounds are then
+    the Clopper-Pearson ones of p G events in G trials, one trial per scene, as if the seeds of a scene were copies.
+    """
+    n = means.shape[-1]
+    p = means.mean(axis=-1)
+    error = means.std(axis=-1, ddof=1) / np.sqrt(n)
+    flat = np.ptp(means, axis=-1) == 0.0
+    inside = np.where(flat | (p <= 0.0) | (p >= 1.0), 0.5, p)
+    logit = np.log(inside / (1 - inside))
+    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error / (inside * (1 - inside))
+    low, high = _expit(logit - half), _expit(logit + half)
+    if np.any(flat):
+        exact_low, exact_high = _clopper_pearson(p * n, n)
+        low, high = np.where(flat, exact_low, low), np.where(flat, exact_high, high)
+    return np.asarray(low), np.asarray(high)
+
+
+def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple[F64, I64]:
+    """Return the mean ``(G,)`` and size ``(G,)`` of each cluster; the one partition every statistic uses.
+
+    Args:
+        values: ``(N,)``.
+        clusters: Name of each value's cluster, or its number from 0 up; the result is in their order, without numbers that no value has.
+    """
+    group = np.asarray(clusters)
+    if not np.issubdtype(group.dtype, np.integer):  # names; numbers are not sorted, as a run may have millions of cells
+        group = np.unique(group, return_inverse=True)[1].reshape(-1)
+    size = np.bincount(group)
+    there = size > 0
+    total = np.bincount(group, weights=np.asarray(values, dtype=np.float64))
+    return total[there] / size[there], size[there]
+
+
+def n_clusters(clusters: I64) -> int:
+    """Return how many different clusters there are among the numbers ``(N,)`` of the values' clusters, from 0 up."""
+    return int(np.count_nonzero(np.bincount(clusters)))
+
+
+def clustered(values: npt.ArrayLike, clusters: Sequence[str] | I64, is_rate: bool = False) -> Interval:
+    """Return the interval with scenes as clusters: t on the scene means, for rates on the logit scale (`logit_t_bounds`).
+
+    Its centre is the mean of the scene means, which is the mean of the values where every scene has as many.
+
+    Args:
+        values: ``(N,)``.
+        clusters: Scene of each value.
+        is_rate: Values are 0 or 1, or averages of such.
+    """
+    means, _ = cluster_means(values, clusters)
+    return rate_interval(means) if is_rate else t_interval(means, "scenes")
+
+
+def rate_interval(means: F64) -> Interval:
+    """Return the interval of a rate from the rate of each scene ``(G,)``; see `logit_t_bounds`.
+
+    Raises:
+        EvaluatorError: A value outside [0, 1].
+    """
+    n, centre = len(means), float(np.mean(means))
+    if means.min() < 0.0 or means.max() > 1.0:
+        found = f"values from {means.min():g} to {means.max():g}"
+        raise EvaluatorError("computing the interval of a rate", f"{n} scene means", found, "give rates as fractions in [0, 1]")
+    if n < 2:
+        return Interval(centre, reason=f"needs at least two scenes, found {n}")
+    low, high = logit_t_bounds(means)
+    if np.ptp(means) == 0.0:
+        note = f"{centre * n:g} of {n} scenes: exact bounds, as equal scenes have no spread"
+        return Interval(centre, float(low), float(high), note=note, method="exact, scenes as trials")
+    return Interval(centre, float(low), float(high), method="t on scenes, logit scale")
+
+
+def exact_rate(k: float, n: int) -> tuple[float, float]:
+    """Return the Clopper-Pearson bounds of k of n independent trials.
+
+    Example:
+        >>> [round(b, 4) for b in exact_rate(0, 10)]
+        [0.0, 0.3085]
+    """
+    low, high = _clopper_pearson(np.array(float(k)), n)
+    return float(low), float(high)
+
+
+def wilson_rate(k: int, n: int) -> tuple[float, float]:
+    """Return the Wilson score bounds of k of n independent trials.
+
+    Example:
+        >>> [round(b, 3) for b in wilson_rate(3, 10)]
+        [0.108, 0.603]
+    """
+    p = k / n
+    scale = 1 + Z95**2 / n
+    centre = (p + Z95**2 / (2 * n)) / scale
+    half = Z95 * float(np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n * n))) / scale
+    # Where k is 0 or n the bound is the edge itself; rounding would leave it slightly inside.
+    return 0.0 if k == 0 else max(0.0, centre - half), 1.0 if k == n else min(1.0, centre + half)
+
+
+def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float | None:
+    """Return how many times larger the variance of the mean is with scenes as clusters than by the paper's formula.
+
+    None where either has no spread. 4 means that the paper's interval is half as long as it should be.
+    """
+    x = np.asarray(values, dtype=np.float64)
+    means, _ = cluster_means(x, clusters)
+    if len(means) < 2 or np.ptp(x) == 0.0:
+        return None
+    return float(np.var(means, ddof=1) / len(means) / (np.var(x, ddof=1) / len(x)))
+
+
+def _clopper_pearson(k: F64, n: int) -> tuple[F64, F64]:
+    low = np.where(k <= 0, 0.0, scipy.special.betaincinv(np.where(k > 0, k, 1.0), n - k + 1, TAIL))  # quantiles of beta distributions
+    high = np.where(k >= n, 1.0, scipy.special.betaincinv(k + 1, np.where(k < n, n - k, 1.0), 1 - TAIL))
+    return np.asarray(low), np.asarray(high)
+
+
+def _expit(x: F64) -> F64:
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))
+
+
+DRAWS = 2000
+BLOCK = 4_000_000  # drawn scenes held in memory at once
+
+
+def redraws(scenes: int, generator: np.random.Generator, draws: int = DRAWS) -> I64:
+    """Return draws ``(draws, scenes)`` of as many scenes as there are, with replacement, by number."""
+    return generator.integers(0, scenes, size=(draws, scenes))
+
+
+def cluster_bootstrap(values: npt.ArrayLike, clusters: Sequence[str] | I64, drawn: Callable[[int], I64]) -> Interval:
+    """Return the percentile interval of the mean over scenes.
+
+    Too short where scenes are few (docs/experiments/interval-coverage.md); it is a second opinion that assumes no shape, not the default.
+
+    Args:
+        values: ``(N,)``.
+        clusters: Scene of each value.
+        drawn: Gives the draws of a number of scenes, as `redraws` does; of at least two.
+
+    Example:
+        >>> g = np.random.Generator(np.random.Philox(1))
+        >>> one = cluster_bootstrap([0.0, 1.0, 2.0, 3.0], ["a", "b", "c", "d"], lambda scenes: redraws(scenes, g))
+        >>> 0.0 <= one.low < 1.5 < one.high <= 3.0
+        True
+    """
+    means, _ = cluster_means(values, clusters)
+    centre = float(np.mean(means))
+    if len(means) < 2:
+        return Interval(centre, reason=f"needs at least two scenes, found {len(means)}")
+    places = drawn(len(means))
+    low, high = np.quantile(means.take(places).mean(axis=1), [TAIL, 1 - TAIL])
+    note = f"all {len(means)} scenes are equal: the interval has no width" if low == high else ""
+    return Interval(centre, float(low), float(high), note=note, method=f"cluster bootstrap, {len(places)} draws")
+
+
+def resampled_means(means: F64, generator: np.random.Generator, draws: int = DRAWS) -> F64:
+    """Return the mean ``(draws,)`` of each draw of G scenes out of ``(G,)``."""
+    rows = max(1, BLOCK // len(means))
+    parts = [means.take(redraws(len(means), generator, min(rows, draws - start))).mean(axis=1) for start in range(0, draws, rows)]
+    return np.concatenate(parts)

@@ -1,0 +1,241 @@
+"""The blocks of summary.json: means with intervals, paired differences, and what each rule removed, with the bounds that this allows."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.schema import cell_name
+from alpasim_plugin.run_folder.sides import RendererRows, Row, Side, by_renderer, failure_of, metric_names, reason_of
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.statistics.intervals import (
+    cluster_bootstrap,
+    clustered,
+    design_effect,
+    exact_rate,
+    n_clusters,
+    normal_half_width,
+    redraws,
+    wilson_rate,
+    within,
+)
+from evaluators.statistics.paired import Table, base_pairs, paired_sides
+
+BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
+
+
+def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
+    """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 % interval.
+
+    Args:
+        rows: One mapping per rollout with ``renderer``, ``policy``, ``scene``, ``seed``, ``status`` and the metrics, either flat
+            (``METRIC``, ``METRIC_valid``) or under ``metrics``. Rows whose status is not "ok" and invalid values do not enter.
+        known: What the metrics are.
+
+    Returns:
+        RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered`` ([low, high], scenes as clusters) and
+        its ``ci95_clustered_method``, ``ci95_bootstrap`` ([low, high], scenes redrawn), ``design_effect``, ``n_rollouts``, ``n_scenes``,
+        ``n_invalid``, ``unit``, ``direction``; for rates also ``n_events``, ``ci95_wilson`` and ``ci95_exact`` (both as if rollouts were
+        independent). What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
+        ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
+    """
+    return aggregate_sides(by_renderer(rows), metric_names(rows), known)
+
+
+def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS) -> Table:
+    """Average rollouts per renderer and metric; see `aggregate`.
+
+    Args:
+        sides: RENDERER -> its rollouts.
+        metrics: Which metrics.
+        known: What they are.
+    """
+    # Metric by metric: renderers share its column and its draws.
+    found = {name: {renderer: _entry(side, known.info(name)) for renderer, side in sides.items()} for name in metrics}
+    return {renderer: {name: found[name][renderer] for name in metrics} for renderer in sides}
+
+
+def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
+    by_cell = side.values(metric.name)
+    known = np.isfinite(by_cell)
+    values, scenes = by_cell[known], side.scene[known]
+    n, n_ran = len(values), int(side.ok.sum())
+    entry: dict[str, Any] = {
+        "mean": None,
+        "ci95": None,
+        "ci95_clustered": None,
+        "ci95_clustered_method": None,
+        "ci95_bootstrap": None,
+        "design_effect": None,
+        "n_rollouts": n,
+        "n_scenes": n_clusters(scenes),
+        "n_invalid": max(n_ran - n, 0),
+        "unit": metric.unit,
+        "direction": metric.direction,
+    }
+    if n == 0:
+        return entry | {"reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
+    entry["mean"] = float(np.mean(values))
+    entry["ci95"], why = normal_half_width(values)
+    if why:
+        entry["ci95_reason"] = why
+    interval = within(clustered(values, scenes, metric.is_flag), *metric.value_range)
+    entry["ci95_clustered"], entry["ci95_clustered_method"] = interval.bounds, interval.method or None
+    entry["design_effect"] = design_effect(values, scenes)
+    if interval.reason:
+        entry["ci95_clustered_reason"] = interval.reason
+    if interval.note:
+        entry["note"] = interval.note
+    if entry["n_scenes"] > BOOTSTRAP_SCENES:
+        why = f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"
+    else:
+        found = cluster_bootstrap(values, scenes, partial(_redraws, metric.name))
+        entry["ci95_bootstrap"], why = found.bounds, found.reason
+    if why:
+        entry["ci95_bootstrap_reason"] = why
+    if metric.is_flag:
+        k = int(np.sum(values > 0))
+        entry |= {"n_events": k, "ci95_wilson": None, "ci95_exact": None}
+        if bool(np.all((values == 0.0) | (values == 1.0))):  # as if rollouts were independent trials
+            entry["ci95_wilson"], entry["ci95_exact"] = list(wilson_rate(k, n)), list(exact_rate(k, n))
+    return entry
+
+
+@lru_cache(maxsize=1)
+def _redraws(metric: str, scenes: int) -> I64:
+    """Return the draws of a metric's scenes; keyed by the metric alone, so that renderers meet the same ones."""
+    return redraws(scenes, stream(metric, 0, "aggregate/bootstrap"))
+
+
+STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")
+CUT_RULES = ("steps_after_event", "steps_after_drift")  # the policy drove there, but what happened does not count
+FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
+
+
+def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, dict[str, Any]]:
+    """Count what did not enter the table, per renderer and cause.
+
+    Args:
+        rows: Rollout rows or manifests as for `aggregate`, with ``censored`` (a `Ledger` as dict), ``frames`` and ``frame_events`` where a
+            rollout was scored, and ``failure_class`` or ``error`` where it failed.
+        known: What the metrics are.
+
+    Returns:
+        RENDERER -> ``rollouts`` (planned), ``failed`` (by failure class), ``dropped`` (by reason), the step counts of the ledger summed
+        over rollouts, ``frames`` (rendered in rollouts that ran to their end), ``frame_events`` (by kind: ``black``, ``fixer-nan``, ...),
+        ``frames_passed_raw`` (the fixer's guard took the raw frame), ``invalid`` (METRIC -> number of rollouts and their reasons), and for
+        every rate METRIC -> [least, greatest]: ``bounds_rollouts`` (every missing rollout without, and with, the event) and ``bounds``
+        (also every step that was cut from a scored rollout without, and with, the event), with ``cut`` (METRIC -> rollouts that were cut
+        before the event was seen).
+    """
+    names = metric_names(rows)
+    return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
+
+
+def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -> dict[str, Any]:
+    done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
+    ledgers = [row["censored"] for row in done if row.get("censored")]
+    events: Counter[str] = Counter()
+    for row in done:
+        events.update(row.get("frame_events") or {})
+    out: dict[str, Any] = {
+        "rollouts": len(side.rows),
+        "failed": dict(Counter(failure_of(row) for row, ok in zip(side.rows, side.ok, strict=True) if not ok)),
+        "dropped": dict(Counter(ledger["dropped"] for ledger in ledgers if ledger["dropped"])),
+        **{rule: sum(int(ledger[rule]) for ledger in ledgers) for rule in STEP_RULES},
+        "frames": sum(int(row.get("frames") or 0) for row in done),
+        "frame_events": dict(events),
+        "frames_passed_raw": sum(n for event, n in events.items() if event.startswith(FIXER_GUARD)),
+        "invalid": {},
+        "bounds": {},
+        "bounds_rollouts": {},
+        "cut": {},
+    }
+    steps = [row.get("censored") or {} for row in side.rows]
+    cut = np.array([sum(int(ledger.get(rule) or 0) for rule in CUT_RULES) for ledger in steps], dtype=np.float64)
+    scored = np.array([int(ledger.get("steps_scored") or 0) for ledger in steps], dtype=np.float64)
+    for name in names:
+        values = side.raw(name)
+        absent = np.flatnonzero(side.ok & ~np.isfinite(values))
+        if len(absent):
+            reasons = Counter(reason_of(side.rows[i], name) for i in absent)
+            out["invalid"][name] = {"rollouts": len(absent), "reasons": dict(reasons)}
+        metric = known.info(name)
+        if metric.is_flag:
+            is_share = metric.aggregation == "mean"
+            out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(values, cut, scored, is_share)
+    return out
+
+
+def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[list[float], list[float], int]:
+    """Return the least and greatest that a rate could be, given what is missing.
+
+    Args:
+        values: ``(R,)`` the flag of each planned rollout, NaN where missing; at least one.
+        cut: ``(R,)`` steps that a rule cut from each rollout after the policy took over.
+        scored: ``(R,)`` steps that were scored.
+        is_share: The flag of a rollout is the share of its steps that fired, not whether any did.
+
+    Returns:
+        Bounds over missing rollouts; bounds over missing rollouts and cut steps; how many rollouts were cut before the event was seen.
+    """
+    known = np.isfinite(values)
+    seen, n, missing = values[known], len(values), int(np.sum(~known))
+    cut, scored = cut[known], scored[known]
+    least, greatest = seen, np.where(cut > 0, 1.0, seen)
+    if is_share:
+        steps = np.maximum(scored + cut, 1.0)
+        least, greatest = np.where(cut > 0, seen * scored / steps, seen), np.where(cut > 0, (seen * scored + cut) / steps, seen)
+    over_rollouts = [float(seen.sum()) / n, (float(seen.sum()) + missing) / n]
+    return over_rollouts, [float(least.sum()) / n, (float(greatest.sum()) + missing) / n], int(np.sum(greatest > seen))
+
+
+NO_BASES: Mapping[str, str] = {}
+
+
+def numbers(
+    table: RolloutTable, baseline: str | None = None, bases: Mapping[str, str] = NO_BASES, known: MetricTable = METRICS
+) -> dict[str, Any]:
+    """Return the blocks ``metrics``, ``paired`` and ``paired_with_base`` of ``summary.json`` (docs/statistics.md).
+
+    Args:
+        table: The rollouts.
+        baseline: Renderer that the others are compared with; None, or one that a policy did not meet, is the first.
+        bases: Renderer with a fixer -> the renderer below it; where both were driven and it is not the baseline, the two are paired too.
+        known: What the metrics are.
+    """
+    sides = {policy: table.sides(policy) for policy in table.policies}
+    chosen: dict[str, str | None] = {}  # None where there is nothing to compare
+    for policy, here in sides.items():
+        first = next(iter(here), None) if len(here) > 1 else None
+        chosen[policy] = baseline if len(here) > 1 and baseline in here else first
+    metrics = {policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()}
+    paired: dict[str, Table] = {}
+    with_base: dict[str, Table] = {}
+    for policy, here in sides.items():
+        base = chosen[policy]
+        paired[policy] = {} if base is None else paired_sides(here, table.metrics, base, known=known)
+        with_base[policy] = base_pairs(here, table.metrics, base, bases, known)
+    parts = {"metrics": metrics, "paired": paired, "paired_with_base": with_base}
+    return {name: by_policy(part, dict) for name, part in parts.items()}
+
+
+def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> dict[str, Any]:
+    """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY: policies are never averaged.
+
+    Args:
+        of: POLICY -> what the table is made of.
+        table: Gives RENDERER -> entry.
+    """
+    out: dict[str, Any] = {}
+    for policy, some in of.items():
+        part = table(some)
+        out |= part if len(of) == 1 else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
+    return out

@@ -1,0 +1,224 @@
+"""Verdicts: on a paired difference with a margin, how many scenes would decide it, and the outcome of a run with its exit code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy  # its submodules load on first use; scipy.stats would take a second
+
+from alpasim_plugin.core.types import F64, Direction
+from evaluators.statistics.intervals import TAIL
+
+Cause = Literal["pass", "regression", "policy", "undecided", "infrastructure", "evaluator"]
+
+EXIT_CODES: dict[Cause, int] = {"pass": 0, "regression": 1, "policy": 2, "undecided": 3, "infrastructure": 4, "evaluator": 5}
+WORDS: dict[Cause, str] = {
+    "pass": "PASS",
+    "regression": "FAIL",
+    "policy": "POLICY FAILURE",
+    "undecided": "UNDECIDED",
+    "infrastructure": "INFRASTRUCTURE FAILURE",
+    "evaluator": "EVALUATOR FAILURE",
+}
+# Where causes meet, the first one found here decides: numbers from an incomplete run may mislead either way.
+SEVERITY: tuple[Cause, ...] = ("evaluator", "infrastructure", "policy", "regression", "undecided", "pass")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A cause with one sentence for each thing that led to it."""
+
+    cause: Cause
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """Give the process exit code (docs/cli.md)."""
+        return EXIT_CODES[self.cause]
+
+    @property
+    def title(self) -> str:
+        """Give the verdict as a heading."""
+        return WORDS[self.cause]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome for JSON."""
+        return {"cause": self.cause, "exit_code": self.exit_code, "reasons": list(self.reasons)}
+
+
+def worst(outcomes: list[Outcome]) -> Outcome:
+    """Return the outcome that decides, with the reasons of all that share its cause.
+
+    Example:
+        >>> worst([Outcome("pass"), Outcome("undecided", ("too few scenes",))]).exit_code
+        3
+    """
+    for cause in SEVERITY:
+        mine = [one for one in outcomes if one.cause == cause]
+        if mine:
+            return Outcome(cause, tuple(reason for one in mine for reason in one.reasons))
+    return Outcome("pass")
+
+
+def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> Outcome:
+    """Judge rollouts that could not be run or scored.
+
+    Args:
+        failures: The ``failures`` block of summary.json: ``n_failed``, ``n_rollouts``, ``by_class``.
+        max_share: Share of the planned rollouts that may fail.
+    """
+    n, n_failed, by_class = int(failures["n_rollouts"]), int(failures["n_failed"]), failures["by_class"]
+    if n_failed <= max_share * n:
+        return Outcome("pass")
+    causes = ", ".join(f"{name} {count}" for name, count in by_class.items())
+    said = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
+    alone: Cause | None = next((cause for cause in ("evaluator", "policy") if set(by_class) == {cause}), None)
+    return Outcome(alone or "infrastructure", (said,))
+
+
+Verdict = Literal["non-inferior", "worse", "undecided"]
+Difference = Literal["better", "worse", "none shown"]
+
+ALPHA = 0.05
+ROUNDING = 1e-12  # differences that vary by no more than this, relative, are equal
+
+
+def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
+    """Turn the bounds of a difference so that positive means worse."""
+    return (bounds[0], bounds[1]) if direction == "lower" else (-bounds[1], -bounds[0])
+
+
+def verdict(bounds: list[float] | None, p: float | None, margin: float, direction: Direction) -> Verdict:
+    """Judge a difference by its 95 % interval.
+
+    Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is more than ``margin`` worse, and the test
+    of no difference rejects too (p < 0.05). Undecided: neither. So each of the two claims is wrong in at most 2.5 % of runs, and more data
+    decides. A metric without a better side needs a margin, and a change to either side counts as worse (wrong in at most 5 %).
+
+    Args:
+        bounds: [low, high] of renderer minus baseline, or None.
+        p: Of the test of no difference; None where there is none.
+        margin: How much worse is accepted, in the metric's unit, at least 0.
+        direction: The better side of the metric.
+    """
+    if bounds is None or (direction == "none" and margin == 0.0):
+        return "undecided"
+    low, high = harm(bounds, direction)
+    if direction == "none":
+        low, high = (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(abs(low), abs(high))  # how far from zero
+    if high < margin or (margin == 0.0 and high == low == 0.0):
+        return "non-inferior"
+    return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
+
+
+def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:
+    """Return whether a difference is shown, independent of the margin: the interval excludes 0 and the test rejects."""
+    if bounds is None or direction == "none" or p is None or p >= ALPHA or bounds[0] <= 0.0 <= bounds[1]:
+        return "none shown"
+    return "worse" if harm(bounds, direction)[0] > 0.0 else "better"
+
+
+def sign_test(up: int, down: int) -> float:
+    """Return the exact two-sided p of ``up`` against ``down`` under a fair coin; 1 where both are 0.
+
+    On scenes that changed it is the sign test; on discordant cells of a flag it is the exact McNemar test.
+
+    Example:
+        >>> round(sign_test(6, 0), 5)
+        0.03125
+    """
+    return min(1.0, 2.0 * float(scipy.special.bdtr(min(up, down), up + down, 0.5)))
+
+
+def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
+    """Test that scene differences ``(G,)`` centre on zero.
+
+    Flags, and differences that are all alike (where t has no spread to go by), take the exact two-sided sign test on the scenes that
+    changed; other metrics the paired t test.
+    """
+    alike = float(np.ptp(means)) <= ROUNDING * float(np.max(np.abs(means)))
+    if is_flag or alike:
+        return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
+    t = float(np.mean(means) / (np.std(means, ddof=1) / np.sqrt(len(means))))
+    return 2.0 * float(scipy.special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
+
+
+POWER = 0.8
+MOST_SCENES = 100_000  # beyond, this suite cannot decide it
+LEAST_DECIDED_FLAGS = 6  # fewer changed scenes cannot reach p < 0.05 in the two-sided sign test
+
+
+def scenes_needed(distance: float, spread: float, power: float = POWER, tail: float = TAIL) -> int | None:
+    """Return the number of scenes at which a 95 % t interval leaves out the margin with probability ``power``.
+
+    N is the least with N >= ((t(0.975, N-1) + t(power, N-1)) spread / distance)^2, the usual sample size of a one-sample t test.
+
+    Args:
+        distance: Of the true difference from the margin, in the metric's unit.
+        spread: Standard deviation of the difference between scenes (seeds averaged), same unit.
+        power: Wanted probability.
+        tail: Probability of the interval's one end, 2.5 % for one of 95 %.
+
+    Returns:
+        At least 2; None where more than `MOST_SCENES` would be needed, or the difference lies on the margin.
+
+    Example:
+        >>> scenes_needed(distance=0.5, spread=1.0)
+        34
+    """
+    if spread == 0.0 and distance != 0.0:
+        return 2
+    if distance == 0.0 or not math.isfinite(spread / distance):
+        return None
+    low, high = 2, MOST_SCENES
+    if not _decides(high, distance, spread, power, tail):
+        return None
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if _decides(middle, distance, spread, power, tail) else (middle + 1, high)
+    return low
+
+
+def scenes_without_event(margin: float) -> int | None:
+    """Return how many scenes without a single changed outcome show a rate difference below the margin (exact bound).
+
+    Example:
+        >>> scenes_without_event(0.05)
+        72
+    """
+    if margin <= 0.0:
+        return None
+    if margin >= 1.0:
+        return 2
+    n = math.log(TAIL) / math.log1p(-margin)
+    return max(2, math.ceil(n)) if n <= MOST_SCENES else None
+
+
+def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_flag: bool) -> int | None:
+    """Return about how many more scenes would decide an undecided verdict with 80 % probability, if what was seen is true.
+
+    Args:
+        harm: The difference seen, positive is worse.
+        spread: Standard deviation of the difference between scenes.
+        n_scenes: Scenes so far.
+        margin: As for the verdict.
+        is_flag: The metric is a rate.
+
+    Returns:
+        At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be needed.
+    """
+    needed = scenes_without_event(margin) if is_flag and spread == 0.0 and harm == 0.0 else scenes_needed(abs(harm - margin), spread)
+    if needed is None:
+        return None
+    if spread == 0.0 and harm > margin:
+        needed = max(needed, LEAST_DECIDED_FLAGS)
+    return max(1, needed - n_scenes)
+
+
+def _decides(n: int, distance: float, spread: float, power: float, tail: float) -> bool:
+    quantiles = float(scipy.special.stdtrit(n - 1, 1 - tail) + scipy.special.stdtrit(n - 1, power))
+    return math.sqrt(n) * abs(distance) >= quantiles * spread
