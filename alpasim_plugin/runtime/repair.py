@@ -56,8 +56,8 @@ def repair_run(found: Inspection, workers: int | None, progress: Progress, wait:
     if plan.content != found.info.get("content"):
         now = "the scenario, a part or the version has changed since the run: new rollouts would not be comparable with the old ones"
         raise InputError("repairing a run", str(found.root), now, f"run everything again: {command_of(found)}")
-    skipped = (found.info.get("determinism") or {}).get("status") == "skipped"
-    certificate: Certify = "none" if skipped else "one"
+    before = found.info.get("determinism") or {}
+    certificate: Certify = "none" if before.get("status") == "skipped" and "error" not in before else "one"
     report = (found.root / REPORTS[0]).exists()
     execute_run(plan, found.root, workers, found.info["command"], progress, True, certificate, report, wait=wait, full=True)
 
