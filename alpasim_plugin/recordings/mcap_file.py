@@ -15,8 +15,7 @@ from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, Box, Trajectory
 from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.recordings import foxglove as fg
-from alpasim_plugin.recordings.colors import MAP, ROAD_USER, fainter, of_renderer
-from alpasim_plugin.recordings.content import DOING, Camera, Drive, Line, Recording, present
+from alpasim_plugin.recordings.content import DOING, MAP, ROAD_USER, Camera, Drive, Line, Recording, fainter, of_renderer, present
 
 WORLD = "world"
 THICK_M, THIN_M = 0.3, 0.12

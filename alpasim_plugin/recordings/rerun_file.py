@@ -14,8 +14,7 @@ from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.recordings.colors import MAP, ROAD_USER, Rgba, as_bytes, fainter, of_renderer
-from alpasim_plugin.recordings.content import DOING, Camera, Drive, Recording, present
+from alpasim_plugin.recordings.content import DOING, MAP, ROAD_USER, Camera, Drive, Recording, Rgba, as_bytes, fainter, of_renderer, present
 from evaluators.metrics import METRICS
 
 TIMELINE = "t"

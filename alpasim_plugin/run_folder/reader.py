@@ -21,7 +21,6 @@ from alpasim_plugin.io.reading import parsing, read_json_as, read_json_object
 from alpasim_plugin.run_folder.check import planned_cells
 from alpasim_plugin.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
-from alpasim_plugin.run_folder.scenes import SceneFile
 from alpasim_plugin.run_folder.schema import (
     AGAIN,
     CONTENTS,
@@ -38,7 +37,7 @@ from alpasim_plugin.run_folder.schema import (
     SUMMARY,
     metrics_in,
 )
-from alpasim_plugin.run_folder.shapes import RunInfo, Summary
+from alpasim_plugin.run_folder.shapes import RunInfo, SceneFile, Summary
 from alpasim_plugin.run_folder.writer import rollout_table
 
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")

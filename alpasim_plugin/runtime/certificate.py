@@ -39,9 +39,9 @@ def certify(
         before: The folder's earlier certificate; it is kept if it certifies the same rollout and the same log.
 
     Returns:
-        ``status`` (equal, different, skipped), ``reason`` where skipped, ``error`` (four parts) where the repeat failed, ``cell``, ``path``,
-        ``rollout_key``, ``score_key``, ``steps``, ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout), ``repeated``
-        (those of the repeat), ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
+        ``status`` (equal, different, skipped), ``reason`` where skipped, ``error`` (its four parts) where the repeat failed, ``cell``,
+        ``path``, ``rollout_key``, ``score_key``, ``steps``, ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout),
+        ``repeated`` (those of the repeat), ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
     """
     if mode == "none":
         return {"status": "skipped", "reason": "switched off with --certify none"}

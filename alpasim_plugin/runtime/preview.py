@@ -22,7 +22,7 @@ from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.core.types import F64, U8, Actor, RenderRequest, Scenario
 from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.renderers.background import background_note
-from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
 
 DOING = "previewing a scenario"

@@ -9,8 +9,7 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.run_folder.check import Inspection, inspect_run
-from alpasim_plugin.run_folder.repair import command_of, prepare_reading, restore_run
+from alpasim_plugin.run_folder.check import Inspection, command_of, inspect_run, prepare_reading, restore_run
 from alpasim_plugin.run_folder.schema import DOING, REPORTS, RUN_INFO
 from alpasim_plugin.run_folder.writer import writing
 from alpasim_plugin.runtime.certificate import Certify
@@ -20,7 +19,7 @@ from scenarios.suite import ScenarioRef
 
 
 def use_run(root: Path, say: Callable[[str], None]) -> None:
-    """Check a run folder before its tables are read; see `alpasim_plugin.run_folder.repair.prepare_reading`."""
+    """Check a run folder before its tables are read; see `alpasim_plugin.run_folder.check.prepare_reading`."""
     prepare_reading(root, say, remake_tables)
 
 

@@ -12,10 +12,8 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.viewer.cells import WatchedCell
-from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
-from alpasim_plugin.viewer.map_data import map_data, recorded_drive
+from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
-from alpasim_plugin.viewer.units import Place
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
 from evaluators.report.events import clock_zero_us
