@@ -85,6 +85,29 @@ def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
     return log
 
 
+def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
+    """Return what every view from above draws of a map, as the report's does: ``lanes``, ``paint``, ``edges`` and ``crosswalks``.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+
+    Returns:
+        Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
+    """
+    lanes = content.get("lanes") or []
+
+    def arrays(lines: Sequence[Any], least: int) -> list[F64]:
+        """Return the lines of at least so many points."""
+        return [np.asarray(line, dtype=np.float64)[:, :2] for line in lines if line is not None and len(line) >= least]
+
+    return {
+        "lanes": arrays([lane_ring(lane) for lane in lanes], 3),
+        "paint": arrays([edge for lane in lanes for edge in painted_edges(lane)], 2),
+        "edges": arrays(content.get("road_edges") or [], 2),
+        "crosswalks": arrays(content.get("crosswalks") or [], 3),
+    }
+
+
 def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:
     """Return the map in whole centimetres.
 
@@ -93,26 +116,16 @@ def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, An
         log: As `recorded_drive` returns it.
         place: Where numbers count from.
     """
-    low, high = log.min(axis=0) - AROUND_M, log.max(axis=0) + AROUND_M
-    window = shapely.box(*low, *high)
+    window = shapely.box(*(log.min(axis=0) - AROUND_M), *(log.max(axis=0) + AROUND_M))
 
-    def near(lines: Sequence[Sequence[Sequence[float]] | None], least: int) -> list[list[list[int]]]:
-        """Simplify the lines of at least so many points that come near."""
-        points = [np.asarray(line, dtype=np.float64)[:, :2] for line in lines if line is not None and len(line) >= least]
-        shapes = shapely.simplify([shapely.linestrings(line) for line in points], TOLERANCE_M, preserve_topology=False)
+    def near(lines: Sequence[F64]) -> list[list[list[int]]]:
+        """Simplify the lines that come near."""
+        shapes = shapely.simplify([shapely.linestrings(line) for line in lines], TOLERANCE_M, preserve_topology=False)
         kept = {shape.wkb: shape for shape in shapes if window.intersects(shape)}  # a border shared by two lanes is drawn once
         return [place.cm(shapely.get_coordinates(shape)) for shape in kept.values()]
 
-    lanes = content.get("lanes") or []
-    return {
-        "turn": round(chord_angle(log), 4),
-        "lanes": near([lane_ring(lane) for lane in lanes], 3),
-        "paint": near([edge for lane in lanes for edge in painted_edges(lane)], 2),
-        "edges": near(content.get("road_edges") or [], 2),
-        "crosswalks": near(content.get("crosswalks") or [], 3),
-        "log": place.cm(log),
-        "source": str(content.get("source") or ""),
-    }
+    lines = {kind: near(some) for kind, some in drawn_map(content).items()}
+    return {"turn": round(chord_angle(log), 4), **lines, "log": place.cm(log), "source": str(content.get("source") or "")}
 
 
 PLAN_STEP_US = 500_000
