@@ -92,9 +92,18 @@ class Side(ABC):
     def raw(self, metric: str) -> F64:
         """Return the metric of every rollout ``(R,)``, NaN where it failed or the value is not valid or not finite."""
 
-    @abstractmethod
     def place_in(self, other: Side) -> I64:
         """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
+        if id(other) not in self._places:
+            self._places[id(other)] = self._placed(other)
+        return self._places[id(other)]
+
+    @cached_property
+    def _places(self) -> dict[int, I64]:
+        return {}
+
+    @abstractmethod
+    def _placed(self, other: Side) -> I64: ...
 
     @abstractmethod
     def first_row(self, cell: Cell) -> int | None:
@@ -160,12 +169,9 @@ class RendererRows(Side):
             found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
         return np.where(self.ok & np.isfinite(found), found, np.nan)
 
-    def place_in(self, other: Side) -> I64:
-        """Return each cell's index in the other side; see `Side.place_in`."""
-        if id(other) not in self._places:
-            place = {cell: i for i, cell in enumerate(other.cells)}
-            self._places[id(other)] = np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
-        return self._places[id(other)]
+    def _placed(self, other: Side) -> I64:
+        place = {cell: i for i, cell in enumerate(other.cells)}
+        return np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
 
     def first_row(self, cell: Cell) -> int | None:
         """Return the first row of a cell."""
@@ -178,10 +184,6 @@ class RendererRows(Side):
     def failure(self, row: int) -> str:
         """Return the failure class of a row."""
         return failure_of(self.rows[row])
-
-    @cached_property
-    def _places(self) -> dict[int, I64]:
-        return {}
 
     @cached_property
     def _first_rows(self) -> Mapping[Cell, int]:

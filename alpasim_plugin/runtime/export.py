@@ -15,7 +15,7 @@ import os
 import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.runtime.loop_state import shutter_poses
-from alpasim_plugin.runtime.plan import RunOptions
+from alpasim_plugin.runtime.plan import options_of, ref_of
 from alpasim_plugin.runtime.score_logs import check_vouched
 from alpasim_plugin.wire import logging_pb2, sensorsim_pb2
 from evaluators.alpasim import EvalSettings
@@ -115,7 +115,7 @@ def scenes_of(info: Mapping[str, Any]) -> dict[str, tuple[ScenarioRef, Scenario]
             raise InputError(
                 OF_SCENES, f"scene {scene_id!r}", "run.json has no path of its scenario", "export a folder that simrun run wrote"
             )
-        ref = ScenarioRef(given["path"], given.get("seed"), tuple(given.get("overrides", ())), given.get("source"))
+        ref = ref_of(given)
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.content_hash != stated["content_hash"]:
             found = f"{ref.path} is not what was driven: its content has changed"
@@ -274,8 +274,8 @@ def _export_rollout(
 
 
 def _added(rollout: RolloutLog, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any]) -> AddedFrames:
-    options = RunOptions(**{f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]})
-    spec = resolve_renderer(manifest["renderer"], tuple(options.fixer))
+    options = options_of(info)
+    spec = resolve_renderer(manifest["renderer"], options.fixer)
     (main,) = list(alpasim_cameras(scenario.cameras).values())[:1] or (None,)
     if main is None:
         raise InputError(DOING, manifest["path"], "no camera in the scenario, and no image in the log", "add a camera to the scenario")

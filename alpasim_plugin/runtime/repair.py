@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,8 @@ from alpasim_plugin.run_folder.check import Inspection, command_of, inspect_run,
 from alpasim_plugin.run_folder.schema import DOING, REPORTS, RUN_INFO
 from alpasim_plugin.run_folder.writer import writing
 from alpasim_plugin.runtime.certificate import Certify
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, refuse_commands
+from alpasim_plugin.runtime.plan import RunPlan, make_plan, options_of, ref_of, refuse_commands
 from alpasim_plugin.runtime.run import Progress, execute_run, finish_run
-from scenarios.suite import ScenarioRef
 
 
 def use_run(root: Path, say: Callable[[str], None]) -> None:
@@ -67,14 +66,12 @@ def plan_of_run(info: Mapping[str, Any]) -> RunPlan:
     Raises:
         InputError: A scenario or a part is not there any more.
     """
-    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
-    options = RunOptions(**stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")})
     refs = []
     for name, scene in info["scenes"].items():
         ref = scene.get("ref")
         if not isinstance(ref, dict) or not isinstance(ref.get("path"), str):
             raise InputError("repairing a run", RUN_INFO, f"it has no path of the scenario {name}", "give the command of the run again")
-        refs.append(ScenarioRef(ref["path"], ref.get("seed"), tuple(ref.get("overrides") or ()), ref.get("source")))
+        refs.append(ref_of(ref))
     refuse_commands(info["policies"], "repairing a run", RUN_INFO)
-    plan = make_plan(refs, info["renderers"], info["policies"], info["seeds"], options)
+    plan = make_plan(refs, info["renderers"], info["policies"], info["seeds"], options_of(info))
     return replace(plan, asked=tuple(info.get("asked") or ()))

@@ -7,8 +7,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.io.atomic import write_bytes, write_json
@@ -17,6 +15,7 @@ from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, probe_folder
 from alpasim_plugin.viewer.page import write_flips_page
+from alpasim_plugin.viewer.pictures import smaller
 from evaluators.opening import read_run
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.report import write_junit, write_report, write_summary_md
@@ -115,9 +114,7 @@ def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
     if not shown:
         return None
     rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
-    if rgb.shape[1] > PICTURE_WIDTH:
-        rgb = cv2.resize(rgb, (PICTURE_WIDTH, round(rgb.shape[0] * PICTURE_WIDTH / rgb.shape[1])), interpolation=cv2.INTER_AREA)
-    write_bytes(root / name, encode_image(rgb, "jpeg", 85))
+    write_bytes(root / name, encode_image(smaller(rgb, PICTURE_WIDTH), "jpeg", 85))
     return name
 
 

@@ -18,6 +18,7 @@ from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.run_folder.rows import Rollout, series_by_cell
+from alpasim_plugin.run_folder.schema import FRAMES_NAME
 from evaluators.opening import Run
 from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
 from evaluators.report.events import SERIES, Event, events_of
@@ -131,7 +132,6 @@ def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, An
 PLAN_STEP_US = 500_000
 MAX_SAMPLES = 8  # of a plan; the first ones
 POSE_SERIES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
-FRAME_FACTS = "frames.jsonl"
 MAX_FRAME_EVENTS = 20
 CONTACT_TOLERANCE_S = 0.25  # between a contact and the step that counts it
 
@@ -217,13 +217,11 @@ def _user(name: str, label: str, size_m: tuple[float, float], way: dict[str, lis
 
 def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
     """Return a plan and its samples, every half second: points from now on."""
-    lines = [plan.trajectory, *plan.samples[:MAX_SAMPLES]]
-    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": [_points(line, place) for line in lines]}
-
-
-def _points(line: Trajectory, place: Place) -> list[list[int]]:
-    times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
-    return place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1))
+    lines = []
+    for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES]):
+        times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
+        lines.append(place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1)))
+    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": lines}
 
 
 def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
@@ -274,7 +272,7 @@ def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
 
 def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, Any]]:
     """Return when an event of the frames began, such as a fixer's frame that was replaced; one that goes on is told once."""
-    path = run.file_of(rollout, FRAME_FACTS)
+    path = run.file_of(rollout, FRAMES_NAME)
     found: list[dict[str, Any]] = []
     before: set[str] = set()
     for row in read_facts(path) if path is not None else []:

@@ -258,14 +258,10 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
     if not any(cell.watchable for cell in cells):
         raise InputError(DOING, str(run.folder), "no finished rollout that was asked for", "ask for others; simrun report lists failures")
     with reporting(run):
-        page = make_page(run, cells, shown_by_default(cells, wanted, at_most), options, _report_beside(run, path))
+        beside = path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file()
+        page = make_page(run, cells, shown_by_default(cells, wanted, at_most), options, REPORT if beside else "")
     write_text(path, page.html, DOING)
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
-
-
-def _report_beside(run: Run, path: Path) -> str:
-    """Return the address of the run's report for a page in its folder; "" for other pages and without a report."""
-    return REPORT if path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file() else ""
 
 
 def write_flips_page(root: Path) -> Mapping[tuple[str, str, str, int], str]:

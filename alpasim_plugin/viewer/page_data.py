@@ -11,6 +11,7 @@ from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import LOG_NAME
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
@@ -20,7 +21,6 @@ from evaluators.report.events import clock_zero_us
 from evaluators.report.flips import FLIPS_NAME, baseline_of
 
 DOING = "reading a rollout to watch"
-LOG = "rollout.asl"
 
 
 Logs = Mapping[str, RolloutLog | SimrunError | None]  # folder of a rollout -> its log, or why it cannot be read
@@ -32,7 +32,7 @@ def read_logs(run: Run, cell: WatchedCell) -> Logs:
 
 
 def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
-    path = run.file_of(rollout, LOG)
+    path = run.file_of(rollout, LOG_NAME)
     if path is None:
         stated = run.manifest(rollout).get("log")  # as it was named to simrun score, so from the same working directory
         path = None if stated is None else Path(str(stated))
