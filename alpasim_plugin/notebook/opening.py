@@ -17,7 +17,6 @@ from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import KEYS, LOG_NAME, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE
-from evaluators.metrics import MetricInfo
 from evaluators.opening import Run, read_run
 from evaluators.report.frames import inline_jpeg
 from evaluators.report.headline import find
@@ -292,7 +291,11 @@ def rollout_html(run: Run, rollout: Rollout) -> str:
     """Return a rollout: how it ended, its headline metrics, and its strip of frames."""
     metrics = [run.table.shown(name) for name in run.table.ordered(rollout.metrics)]
     metrics = [metric for metric in metrics if metric.is_headline] or metrics
-    lines = [[escape(metric.name), _number(rollout.metrics.get(metric.name), metric)] for metric in metrics]
+    lines = []
+    for metric in metrics:
+        value = rollout.metrics.get(metric.name)
+        shown = DASH if value is None else f"{100 * value:.1f} %" if metric.in_percent else escape(short(value, metric.unit))
+        lines.append([escape(metric.name), shown])
     return _block(
         f"<b>{escape(outcome(rollout))}</b>",
         escape(title(rollout)),
@@ -312,12 +315,6 @@ def outcome(rollout: Rollout) -> str:
         return f"failed ({rollout.failure_class}): {rollout.failure}"
     events = [word for word, metric in (("collision", "collision_any"), ("off-road", "offroad")) if rollout.flag(metric)]
     return " and ".join(events) or "no event"
-
-
-def _number(value: float | None, metric: MetricInfo) -> str:
-    if value is None:
-        return DASH
-    return f"{100 * value:.1f} %" if metric.in_percent else escape(short(value, metric.unit))
 
 
 def _picture(run: Run, rollout: Rollout) -> str:

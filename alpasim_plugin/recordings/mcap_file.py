@@ -18,7 +18,7 @@ from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, Box, CameraSpec, Trajectory
 from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.recordings.content import DOING, MAP, ROAD_USER, Camera, Drive, Line, Recording, Rgba, fainter, of_renderer, present
+from alpasim_plugin.recordings.content import DOING, MAP, ROAD_USER, Camera, Drive, Recording, Rgba, fainter, of_renderer, present
 
 WORLD = "world"
 THICK_M, THIN_M = 0.3, 0.12
@@ -118,24 +118,24 @@ def require_mcap() -> Any:
 
 def _streams(recording: Recording) -> Iterator[Iterator[Item]]:
     """Yield what is written, each part in order of time."""
-    yield iter([(recording.start_us, "/map", SCENE_UPDATE, _map(recording.start_us, recording.lines))])
+    start_us, lines = recording.start_us, recording.lines
+    kinds = dict.fromkeys(line.kind for line in lines)
+    drawn = {kind: [polyline(line.points, MAP[kind], THIN_M) for line in lines if line.kind == kind] for kind in kinds}
+    scene = scene_update(*(entity(start_us, kind, WORLD, lines=some) for kind, some in drawn.items()))
+    yield iter([(start_us, "/map", SCENE_UPDATE, scene)])
     for number, drive in enumerate(recording.drives):
         rgba = of_renderer(number)
         yield _transforms(drive)
         yield _boxes(drive, rgba)
-        yield iter([_driven_path(drive, rgba)])
+        first_us = int(drive.rig.t_us[0])
+        path = entity(first_us, "path", WORLD, lines=[polyline(drive.rig.xyz, fainter(rgba, 0.6), THIN_M)])
+        yield iter([(first_us, f"/{drive.label}/path", SCENE_UPDATE, scene_update(path))])
         yield _plans(drive, rgba)
         yield _metrics(drive)
         yield _events(drive)
         for camera in drive.cameras:
             yield _calibration(drive, camera)
             yield _images(drive, camera)
-
-
-def _map(t_us: int, lines: Sequence[Line]) -> Message:
-    kinds = dict.fromkeys(line.kind for line in lines)
-    drawn = {kind: [polyline(line.points, MAP[kind], THIN_M) for line in lines if line.kind == kind] for kind in kinds}
-    return scene_update(*(entity(t_us, kind, WORLD, lines=some) for kind, some in drawn.items()))
 
 
 def _transforms(drive: Drive) -> Iterator[Item]:
@@ -176,12 +176,6 @@ def _boxes(drive: Drive, rgba: Rgba) -> Iterator[Item]:
 def _cube(box: Box, track: Trajectory, at: int, rgba: Rgba) -> Message:
     size_m = vector(np.array([box.length_m, box.width_m, box.height_m]))
     return {"pose": pose(track.xyz[at], track.quat[at]), "size": size_m, "color": colour_of(rgba)}
-
-
-def _driven_path(drive: Drive, rgba: Rgba) -> Item:
-    t_us = int(drive.rig.t_us[0])
-    path = entity(t_us, "path", WORLD, lines=[polyline(drive.rig.xyz, fainter(rgba, 0.6), THIN_M)])
-    return t_us, f"/{drive.label}/path", SCENE_UPDATE, scene_update(path)
 
 
 def _plans(drive: Drive, rgba: Rgba) -> Iterator[Item]:

@@ -178,20 +178,17 @@ class Run:
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
         """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason, from the ledger or else the steps."""
-        found = self._step_reasons()
+        columns = ["renderer", "metric", "reason"]
+        table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
+        counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
+        rows = counts.to_pylist()  # ascending: the most frequent reason is written last
+        found = {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
         for renderer, ledger in (self.summary.get("censoring") or {}).items():
             for metric, entry in (ledger.get("invalid") or {}).items():
                 reasons = entry.get("reasons") or {}
                 if reasons:
                     found[renderer, metric] = max(reasons, key=lambda reason: reasons[reason])
         return found
-
-    def _step_reasons(self) -> dict[tuple[str, str], str]:
-        columns = ["renderer", "metric", "reason"]
-        table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
-        counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
-        rows = counts.to_pylist()  # ascending: the most frequent reason is written last
-        return {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
 
 
 @dataclass(frozen=True)

@@ -68,11 +68,6 @@ def is_ok(row: Row) -> bool:
     return bool(row.get("status", "ok") == "ok")
 
 
-def cell_of(row: Row) -> Cell:
-    """Return what identifies a rollout apart from its renderer."""
-    return str(row["policy"]), str(row["scene"]), int(row["seed"])
-
-
 class Side(ABC):
     """The rollouts of one renderer, laid out by cell: what every statistic over rollouts reads.
 
@@ -148,7 +143,7 @@ class RendererRows(Side):
     @classmethod
     def of(cls, rows: Sequence[Row]) -> RendererRows:
         """Sort rows of one renderer."""
-        keys = [cell_of(row) for row in rows]
+        keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
         cells = tuple(sorted(set(keys)))
         place = {cell: i for i, cell in enumerate(cells)}
         scenes = {name: i for i, name in enumerate(sorted({c[1] for c in cells}))}
@@ -162,11 +157,7 @@ class RendererRows(Side):
 
     def raw(self, metric: str) -> F64:
         """Return the metric of every row; see `Side.raw`."""
-        if self._flat:
-            key = metric + VALID
-            found = np.array([row.get(metric) if row.get(key, True) else None for row in self.rows], dtype=np.float64)
-        else:
-            found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
+        found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
         return np.where(self.ok & np.isfinite(found), found, np.nan)
 
     def _placed(self, other: Side) -> I64:
@@ -191,10 +182,6 @@ class RendererRows(Side):
         for i, c in enumerate(self.cell.tolist()):
             found.setdefault(self.cells[c], i)
         return found
-
-    @cached_property
-    def _flat(self) -> bool:
-        return not any(isinstance(row.get("metrics"), Mapping) for row in self.rows)
 
 
 def by_renderer(rows: Sequence[Row]) -> dict[str, RendererRows]:

@@ -295,7 +295,7 @@ class Recorder:
             "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
-            "strip_t_us": [] if self._pictures is None else self._pictures.strip_us,
+            "strip_t_us": [] if self._pictures is None else [t_us for t_us, _ in self._pictures.strip()],
         }
 
     def save_pictures(self, video: bool) -> None:
@@ -332,14 +332,9 @@ class Pictures:
         if frame.camera == self._camera and (self._all or self._in_strip(frame.t_us)):
             self._kept.append((frame.t_us, frame.rgb))
 
-    @property
-    def strip_us(self) -> list[int]:
-        """Give the times of the frames in the strip."""
-        return [t_us for t_us, _ in self._strip()]
-
     def save(self, folder: Path, video: bool) -> None:
         """Write the strip, and the video if requested; nothing for a rollout without frames."""
-        strip = [rgb for _, rgb in self._strip()]
+        strip = [rgb for _, rgb in self.strip()]
         if strip:
             write_bytes(folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90))
         if video and self._kept:
@@ -348,5 +343,6 @@ class Pictures:
     def _in_strip(self, t_us: int) -> bool:
         return any(abs(t_us - at_us) * 2 < self._period_us for at_us in self._strip_us)
 
-    def _strip(self) -> list[tuple[int, U8]]:
+    def strip(self) -> list[tuple[int, U8]]:
+        """Return times and pixels of the strip's frames."""
         return [(t_us, rgb) for t_us, rgb in self._kept if self._in_strip(t_us)]

@@ -110,13 +110,16 @@ def _score(
         rollout = read_asl(log)
     except InputError as error:
         return _failed(manifest, error, root, taken)
+    session = rollout.session_uuid or name  # as in AlpaSim; a second log with that id gets its folder's name with it
+    session = session if session not in names else f"{session} ({name})"
+    names.add(session)
     versions = rollout.info["versions"]
     manifest |= {
         "renderer": _named(versions.get("sensorsim"), versions.get("video_model")),
         "policy": _named(versions.get("egodriver")),
         "scene": rollout.scene_id,
         "seed": int(rollout.seed) & (2**63 - 1),
-        "rollout": _rollout_name(rollout.session_uuid, name, names),
+        "rollout": session,
         "session_uuid": rollout.session_uuid,
         "frames": len(rollout.images),
         "steps": _steps(rollout),
@@ -135,14 +138,6 @@ def _score(
     write_steps(root / manifest["path"], [keys | row for row in one.steps], of_logs=True)
     run_uuid, run_name = run_names(log)
     return LogScore(manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name))
-
-
-def _rollout_name(session_uuid: str, folder: str, names: set[str]) -> str:
-    """Return the name of a rollout, its session id as in AlpaSim; a second log with that id gets its folder's name with it."""
-    name = session_uuid or folder
-    name = name if name not in names else f"{name} ({folder})"
-    names.add(name)
-    return name
 
 
 def check_vouched(log: Path) -> None:

@@ -15,7 +15,6 @@ from alpasim_plugin.run_folder.schema import LOG_NAME
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
-from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
 from evaluators.report.events import clock_zero_us
 from evaluators.report.flips import FLIPS_NAME, baseline_of
@@ -115,13 +114,16 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
     """
     ids = {cell.id for cell in here}
     units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}
-    base = baseline_of(run)
+    metrics = {}
+    for name in run.table.ordered({*run.table, *units}):
+        metric, stated = run.table.shown(name), units.get(name) or {}
+        metrics[name] = {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
     return {
         "run": run.folder.resolve().name,
         "renderers": run.renderers,
-        "baseline": base,
+        "baseline": baseline_of(run),
         "first_curves": run.table.first_curves(),
-        "metrics": {name: _metric(run.table.shown(name), units.get(name) or {}) for name in run.table.ordered({*run.table, *units})},
+        "metrics": metrics,
         "cells": [
             {
                 "id": cell.id,
@@ -138,10 +140,6 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         ],
         **state,
     }
-
-
-def _metric(metric: MetricInfo, stated: Mapping[str, Any]) -> dict[str, Any]:
-    return {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
 
 
 def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:
