@@ -59,7 +59,7 @@ __getattr__ = lazy_names(
     {
         "load_scenario": "scenarios.load",
         "make_policy": "policies",
-        "make_renderer": ".runtime.compose",
+        "make_renderer": ".runtime.cell",
         "open_run": ".notebook.opening",
         "run_rollout": ".runtime.rollout",
         "serve_policy": ".alpasim.server.one_policy",

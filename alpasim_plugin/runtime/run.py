@@ -30,11 +30,11 @@ from alpasim_plugin.run_folder.schema import CONTENTS, REPORTS, RUN_INFO, SUMMAR
 from alpasim_plugin.run_folder.writer import write_scene, writing
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.certificate import Certify, certify
+from alpasim_plugin.runtime.commits import opened
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
-from alpasim_plugin.runtime.stores.commits import opened
 from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import MetricTable, table_of

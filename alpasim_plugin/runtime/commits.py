@@ -20,8 +20,8 @@ from alpasim_plugin.plugins.parts import digest
 from alpasim_plugin.run_folder.manifests import read_manifest, write_manifest
 from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, MANIFEST, OUTPUT_NAME
 from alpasim_plugin.runtime.cell import run_cell
+from alpasim_plugin.runtime.objects import Objects, open_objects
 from alpasim_plugin.runtime.plan import Cell, RunOptions
-from alpasim_plugin.runtime.stores.objects import Objects, open_objects
 from scenarios.suite import ScenarioRef
 
 NAMES = (*DRIVEN, *DERIVED)
