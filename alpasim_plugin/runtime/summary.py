@@ -171,9 +171,9 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
     _check_alike(infos)
     first = next(iter(infos.values()))
     table = RolloutTable.of_files([run / ROLLOUTS for run in runs])
-    known = list(dict.fromkeys(name for policy in table.policies for name in table.sides(policy)))
-    if baseline is not None and baseline not in known:
-        raise InputError(DOING, f"--baseline {baseline}", "no rollout has it", f"choose one of {', '.join(known) or 'none'}")
+    renderers = list(dict.fromkeys(name for policy in table.policies for name in table.sides(policy)))
+    if baseline is not None and baseline not in renderers:
+        raise InputError(DOING, f"--baseline {baseline}", "no rollout has it", f"choose one of {', '.join(renderers) or 'none'}")
     known = _joined(infos, table.metrics)
     bases = {name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()}
     by_class = table.failures()

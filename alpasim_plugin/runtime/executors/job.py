@@ -60,9 +60,9 @@ class RolloutWork:
     store: str | None = None
     fresh: str = ""
 
-    def __call__(self, item: Cell, node: Node) -> RolloutResult | Faulty[RolloutResult]:
+    def __call__(self, job: Cell, node: Node) -> RolloutResult | Faulty[RolloutResult]:
         """Drive one cell; what says more of the node than of the rollout comes back as `Faulty`."""
-        cell = item
+        cell = job
         share_measurements(measured_folder(self.run))
         try:
             with scratch_folder(scratch_root() / "rollout", "driving on a node") as scratch:
