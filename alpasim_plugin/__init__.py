@@ -15,7 +15,7 @@ from alpasim_plugin.core.lazy import lazy_names
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.one_policy import serve_policy
     from alpasim_plugin.notebook.opening import open_run
-    from alpasim_plugin.runtime.compose import make_renderer
+    from alpasim_plugin.runtime.cell import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from policies import make_policy
     from scenarios.load import load_scenario
@@ -59,7 +59,7 @@ __getattr__ = lazy_names(
     {
         "load_scenario": "scenarios.load",
         "make_policy": "policies",
-        "make_renderer": ".runtime.compose",
+        "make_renderer": ".runtime.cell",
         "open_run": ".notebook.opening",
         "run_rollout": ".runtime.rollout",
         "serve_policy": ".alpasim.server.one_policy",

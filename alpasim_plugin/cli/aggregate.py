@@ -11,7 +11,7 @@ from rich.console import Console
 from alpasim_plugin.cli.options import Every, Json
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.runtime.overall import aggregate_runs, joined_metrics
+from alpasim_plugin.runtime.summary import aggregate_runs, joined_metrics
 from evaluators.report import render_table
 from evaluators.report.tables import pair_rows
 

@@ -12,7 +12,7 @@ from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, finding
 from alpasim_plugin.cli.options import Json, Overrides
 from alpasim_plugin.core.errors import PolicyError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.rollout import run_rollout
 from scenarios.load import load_scenario
 

@@ -15,8 +15,7 @@ from alpasim_plugin.cli.progress import describe, report_line
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.run_folder.manifests import read_run_json
-from alpasim_plugin.runtime.known_scenes import KnownScenes
-from alpasim_plugin.runtime.score_logs import find_logs
+from alpasim_plugin.runtime.score_logs import KnownScenes, find_logs
 from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
 from evaluators import preset as find_preset
 from evaluators import resolve_evaluators

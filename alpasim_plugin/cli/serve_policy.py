@@ -17,7 +17,7 @@ from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import PartSpec, build, resolve
 from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.runtime.known_scenes import scenario_finder
+from alpasim_plugin.runtime.score_logs import scenario_finder
 
 EPILOG = """
 Examples:

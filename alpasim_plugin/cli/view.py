@@ -16,10 +16,9 @@ from alpasim_plugin.run_folder.manifests import read_manifest
 from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.viewer.cells import Wanted
-from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options
+from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options, write_page
 from alpasim_plugin.viewer.pictures import Fineness
 from alpasim_plugin.viewer.serve import RunServer, loopback
-from alpasim_plugin.viewer.write import write_page
 from evaluators.opening import read_so_far
 
 DOING = "watching rollouts"

@@ -18,7 +18,7 @@ from alpasim_plugin.core.types import F64, U8, EgoState, Observation, Plan, Scen
 from alpasim_plugin.gym.actions import Actions, Controls, Trajectories
 from alpasim_plugin.gym.reward import Instant, Judge, Reward
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
-from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import Loop
 from alpasim_plugin.runtime.scoring import score_log

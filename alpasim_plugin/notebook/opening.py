@@ -1,24 +1,27 @@
-"""`open_run`: a run folder as data frames, for notebooks and scripts."""
+"""`open_run`: a run folder as data frames, for notebooks and scripts; runs and rollouts show themselves in a notebook."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.notebook.frames import Library, frame_of, paired_table, require, summary_table, valid_only
-from alpasim_plugin.notebook.html import outcome, rollout_html, run_html, title
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import KEYS, LOG_NAME, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE
 from evaluators.opening import Run, read_run
+from evaluators.report.flips import inline_jpeg
 from evaluators.report.headline import find
+from evaluators.report.numbers import DASH, short
+from evaluators.report.tables import metric_rows
 
 
 def open_run(folder: str | Path, frames: Library = "pandas") -> OpenRun:
@@ -163,3 +166,172 @@ class OpenRollout:
 
     def _repr_html_(self) -> str:
         return rollout_html(self._open._run, self._rollout)
+
+
+Library = Literal["pandas", "polars"]
+LIBRARIES: tuple[Library, ...] = ("pandas", "polars")
+DOING = "making a data frame"
+
+
+def require(library: str) -> Any:
+    """Import a library of data frames.
+
+    Raises:
+        InputError: It is none of the known ones, or not installed.
+    """
+    if library not in LIBRARIES:
+        raise InputError(DOING, f"frames={library!r}", "no such library", f"the libraries are {' and '.join(LIBRARIES)}")
+    other = next(name for name in LIBRARIES if name != library)
+    do_this = f"install the extra [notebook], or pip install {library}; frames={other!r} gives frames of {other}"
+    return require_library(library, DOING, f"frames={library!r}", do_this)
+
+
+def frame_of(table: pa.Table, library: Library) -> Any:
+    """Return a table as a frame of a library; text columns of few values become categories.
+
+    Raises:
+        InputError: The library is not installed.
+    """
+    found = require(library)
+    return table.to_pandas() if library == "pandas" else found.from_arrow(table)
+
+
+def valid_only(table: pa.Table) -> pa.Table:
+    """Return a table of rollouts in which a metric that is not valid has no value.
+
+    The column ``NAME_valid`` of each metric ``NAME`` stays.
+    """
+    for name in [column.removesuffix("_valid") for column in table.column_names if column.endswith("_valid")]:
+        empty = pa.scalar(None, table[name].type)
+        kept = pc.if_else(pc.fill_null(table[f"{name}_valid"], False), table[name], empty)
+        table = table.set_column(table.column_names.index(name), name, kept)
+    return table
+
+
+def summary_table(summary: Mapping[str, Any]) -> pa.Table:
+    """Return ``metrics`` of a summary, one row a renderer and metric."""
+    rows = []
+    for renderer, metrics in (summary.get("metrics") or {}).items():
+        for metric, entry in metrics.items():
+            low, high = _ends(entry.get("ci95_clustered"))
+            facts = {key: entry.get(key) for key in ("mean", "ci95", "n_rollouts", "n_scenes", "unit", "direction")}
+            rows.append({"renderer": renderer, "metric": metric, **facts, "ci95_low": low, "ci95_high": high})
+    return pa.Table.from_pylist(rows, SUMMARY)
+
+
+def paired_table(summary: Mapping[str, Any]) -> pa.Table:
+    """Return the paired differences of a summary, against the baseline and against a fixer's base, one row each."""
+    rows = []
+    for kind in ("paired", "paired_with_base"):
+        for renderer, metrics in (summary.get(kind) or {}).items():
+            for metric, entry in metrics.items():
+                low, high = _ends(entry.get("ci95"))
+                facts = {key: entry.get(key) for key in ("baseline", "diff", "p_value", "verdict")}
+                rows.append({"renderer": renderer, "metric": metric, **facts, "ci95_low": low, "ci95_high": high})
+    return pa.Table.from_pylist(rows, PAIRED)
+
+
+SUMMARY = pa.schema(
+    [
+        ("renderer", pa.string()),
+        ("metric", pa.string()),
+        ("mean", pa.float64()),
+        ("ci95", pa.float64()),
+        ("ci95_low", pa.float64()),
+        ("ci95_high", pa.float64()),
+        ("n_rollouts", pa.int64()),
+        ("n_scenes", pa.int64()),
+        ("unit", pa.string()),
+        ("direction", pa.string()),
+    ]
+)
+PAIRED = pa.schema(
+    [
+        ("renderer", pa.string()),
+        ("baseline", pa.string()),
+        ("metric", pa.string()),
+        ("diff", pa.float64()),
+        ("ci95_low", pa.float64()),
+        ("ci95_high", pa.float64()),
+        ("p_value", pa.float64()),
+        ("verdict", pa.string()),
+    ]
+)
+
+
+def _ends(interval: Sequence[float | None] | None) -> tuple[float | None, float | None]:
+    return (interval[0], interval[1]) if interval is not None else (None, None)
+
+
+MOST_RENDERERS = 6
+LEFT = 'style="text-align:left"'
+
+
+def run_html(run: Run) -> str:
+    """Return a run: its verdict, its headline metrics by renderer, and a strip of frames of its first rollout."""
+    rows = metric_rows(run.summary, known=run.table)
+    rows = [row for row in rows if row.is_headline] or rows
+    names = list(run.summary.get("metrics") or {})[:MOST_RENDERERS]
+    lines = []
+    for row in rows:
+        label = " ".join(part for part in (row.name, row.unit, row.arrow) if part)
+        cells = [f"{cell.text} <small>{escape(cell.detail or cell.count)}</small>" for cell in row.cells[: len(names)]]
+        lines.append([escape(label), *cells])
+    first = next((rollout for rollout in run.rollouts if run.file_of(rollout, "strip.jpg") is not None), None)
+    preset = escape(str(run.summary.get("preset")))
+    return _block(
+        f"<b>{escape(find(run).title)}</b>",
+        f"{len(run.rollouts)} rollouts, {len(run.scenes)} scenes, preset {preset}: {escape(str(run.folder))}",
+        _table(["", *(escape(name) for name in names)], lines),
+        "" if first is None else _picture(run, first),
+    )
+
+
+def rollout_html(run: Run, rollout: Rollout) -> str:
+    """Return a rollout: how it ended, its headline metrics, and its strip of frames."""
+    metrics = [run.table.shown(name) for name in run.table.ordered(rollout.metrics)]
+    metrics = [metric for metric in metrics if metric.is_headline] or metrics
+    lines = []
+    for metric in metrics:
+        value = rollout.metrics.get(metric.name)
+        shown = DASH if value is None else f"{100 * value:.1f} %" if metric.in_percent else escape(short(value, metric.unit))
+        lines.append([escape(metric.name), shown])
+    return _block(
+        f"<b>{escape(outcome(rollout))}</b>",
+        escape(title(rollout)),
+        _table(["metric", "value"], lines),
+        _picture(run, rollout),
+    )
+
+
+def title(rollout: Rollout) -> str:
+    """Name a rollout."""
+    return f"{rollout.renderer}, {rollout.policy}, {rollout.scene}, seed {rollout.seed}"
+
+
+def outcome(rollout: Rollout) -> str:
+    """Say in a few words how a rollout ended."""
+    if not rollout.ok:
+        return f"failed ({rollout.failure_class}): {rollout.failure}"
+    events = [word for word, metric in (("collision", "collision_any"), ("off-road", "offroad")) if rollout.flag(metric)]
+    return " and ".join(events) or "no event"
+
+
+def _picture(run: Run, rollout: Rollout) -> str:
+    path = run.file_of(rollout, "strip.jpg")
+    picture = None if path is None else inline_jpeg(path)
+    if picture is None:
+        return "<small>no frames: the policy has no camera, or the rollout failed</small>"
+    source, width, height = picture
+    words = escape(f"frames of {title(rollout)}", quote=True)
+    return f'<img src="{source}" width="{width}" height="{height}" style="max-width:100%;height:auto" alt="{words}">'
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    heads = "".join(f'<th scope="col" {LEFT}>{cell}</th>' for cell in head)
+    lines = [f'<tr><th scope="row" {LEFT}>{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>" for row in rows]
+    return f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def _block(*parts: str) -> str:
+    return "<div>" + "".join(f"<div>{part}</div>" for part in parts if part) + "</div>"

@@ -12,10 +12,9 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.core.types import F64, I64, Box, Trajectory
+from alpasim_plugin.core.types import I64, Box, Trajectory
 from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.recordings.colors import MAP, ROAD_USER, Rgba, as_bytes, fainter, of_renderer
-from alpasim_plugin.recordings.content import DOING, Camera, Drive, Recording, present
+from alpasim_plugin.recordings.content import DOING, MAP, ROAD_USER, Camera, Drive, Recording, Rgba, as_bytes, fainter, of_renderer, present
 from evaluators.metrics import METRICS
 
 TIMELINE = "t"
@@ -94,7 +93,10 @@ class _Writer:
         for camera in drive.cameras:
             self._camera([*base, "rig", camera.name], camera)
         for name, (t_us, value) in drive.metrics.items():
-            self._scalars(["metrics", name, drive.renderer], t_us, value, rgba)
+            finite, parts = np.isfinite(value), ["metrics", name, drive.renderer]
+            if finite.any():
+                self._columns(parts, t_us[finite], rr.Scalars.columns(scalars=value[finite]))
+                self._stream.log(self._path(parts), rr.SeriesLines(colors=as_bytes(rgba), names=parts[-1]), static=True)
         for at_us, text in drive.events:
             self._at(at_us, ["events", drive.renderer], rr.TextLog(text, level="WARN"))
 
@@ -112,12 +114,6 @@ class _Writer:
         xyzw = track.quat[:, [1, 2, 3, 0]]
         columns = self._rr.Transform3D.columns(translation=track.xyz, quaternion=xyzw)
         self._columns(parts, track.t_us, columns)
-
-    def _scalars(self, parts: list[str], t_us: I64, value: F64, rgba: Rgba) -> None:
-        finite = np.isfinite(value)
-        if finite.any():
-            self._columns(parts, t_us[finite], self._rr.Scalars.columns(scalars=value[finite]))
-            self._stream.log(self._path(parts), self._rr.SeriesLines(colors=as_bytes(rgba), names=parts[-1]), static=True)
 
     def _camera(self, parts: list[str], camera: Camera) -> None:
         rr, spec = self._rr, camera.spec

@@ -1,7 +1,9 @@
-"""Compare a run folder with what it says of itself."""
+"""Compare a run folder with what it says of itself, and make its tables again where only they are damaged; nothing is driven here."""
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -9,8 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder.manifests import AGAIN, Contents, Damage, damaged_files, inspect_rollout, read_contents, read_run_json
+from alpasim_plugin.io.reading.files import as_shape
+from alpasim_plugin.run_folder.manifests import (
+    AGAIN,
+    Contents,
+    Damage,
+    damaged_files,
+    inspect_rollout,
+    read_contents,
+    read_manifest,
+    read_run_json,
+    write_run_json,
+)
 from alpasim_plugin.run_folder.schema import CONTENTS, DOING, MANIFEST, ROLLOUTS_FOLDER, RUN_INFO, TABLES, rollout_folder
+from alpasim_plugin.run_folder.writer import writing
 
 NOT_FINISHED = "missing: the run is not finished, or an older version wrote it"
 NEWER = "newer than the tables"
@@ -119,3 +133,79 @@ def planned_cells(info: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     axes: Sequence[Sequence[Any]] = (list(info["scenes"]), info["renderers"], info["policies"], info["seeds"])
     return tuple(rollout_folder(renderer, policy, scene, seed).as_posix() for scene, renderer, policy, seed in product(*axes))
+
+
+KEPT = ("pool", "determinism", "exit_code", "alpasim")  # members of run.json that the rollouts do not tell
+SHOWN = 5
+
+
+def prepare_reading(root: Path, say: Callable[[str], None], remake: Callable[[Inspection], None]) -> None:
+    """Check a run folder before its tables are read.
+
+    Tables that are missing or damaged are made again if every rollout is whole. Damaged rollouts are named; nothing is driven.
+
+    Args:
+        root: The run folder.
+        say: Called with one line for each thing that is damaged.
+        remake: Makes the tables again, under the lock of the folder.
+
+    Raises:
+        InputError: The tables cannot be trusted and cannot be made again from what is there.
+        InfrastructureError: Another process is writing the folder.
+    """
+    found = inspect_run(root)
+    if found.tables_only:
+        say(f"note: {root} has no rollouts, only tables")
+    if not found.of_run:
+        for one in found.of_rollouts[:SHOWN]:
+            say(f"warning: damaged: {root}/{one}; the tables are whole; simrun check {shlex.quote(str(root))} --repair")
+        if len(found.of_rollouts) > SHOWN:
+            say(f"warning: {len(found.of_rollouts) - SHOWN} more damaged files: simrun check {shlex.quote(str(root))}")
+        return
+    if not os.access(root, os.W_OK):
+        do_this = "copy the folder to where it can be written, and repair the copy: simrun check COPY --repair"
+        raise InputError(DOING, str(root), f"{found.of_run[0]}, and the folder is read-only", do_this)
+    with writing(root):  # whoever writes it now is named here
+        found = inspect_run(root)
+        if found.of_run:
+            _check_remakable(found)
+            for one in found.of_run:
+                say(f"warning: damaged: {root}/{one}; made again from the rollouts")
+            remake(found)
+
+
+def _check_remakable(found: Inspection) -> None:
+    if found.unfinished:
+        there = f"{len(found.cells) - len(found.unfinished)} of {len(found.cells)} rollouts are finished"
+        raise InputError(DOING, str(found.root), f"the run is not finished: {there}", f"give its command again: {command_of(found)}")
+    if not found.is_remakable:
+        problem = [*found.of_rollouts, *(one for one in found.of_run if one.file not in REMADE), *found.of_run][0]
+        raise InputError(DOING, str(found.root), str(problem), f"simrun check {shlex.quote(str(found.root))} --repair")
+
+
+def restore_run(found: Inspection) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Write ``run.json`` again if it is damaged; return the manifests, and what they do not tell of the run.
+
+    Raises:
+        InputError: A manifest is damaged.
+    """
+    if any(one.file == RUN_INFO for one in found.damage):
+        write_run_json(found.root, found.info)
+    manifests = [read_manifest(found.root / cell)[0] for cell in found.cells]
+    config = as_shape(dict[str, Any], found.info["config"], f"{found.root / RUN_INFO}, config", DOING, "make the run again")
+    lost = {
+        "pool": {
+            "workers": config.get("workers"),
+            "threads_per_worker": config.get("threads_per_worker"),
+            "wall_s": None,
+            "frames": sum(int(m.get("frames") or 0) for m in manifests),
+            "frames_per_s_total": None,
+        },
+        "determinism": {"status": "skipped", "reason": "the run was stopped before it repeated a rollout"},
+    }
+    return manifests, lost | {key: found.info[key] for key in KEPT if key in found.info}
+
+
+def command_of(found: Inspection) -> str:
+    """Return the command that made a run, to be typed."""
+    return shlex.join(found.info["command"])

@@ -239,11 +239,8 @@ class RendererColumns(Side):
         """Return the metric of every rollout; see `Side.raw`."""
         return self.table.column(metric)[self.rows]
 
-    def place_in(self, other: Side) -> I64:
-        """Return each cell's index in the other side; see `Side.place_in`."""
-        if id(other) not in self._places:
-            self._places[id(other)] = self.cells.place_in(other.cells if isinstance(other.cells, Cells) else Cells.of(other.cells))
-        return self._places[id(other)]
+    def _placed(self, other: Side) -> I64:
+        return self.cells.place_in(other.cells if isinstance(other.cells, Cells) else Cells.of(other.cells))
 
     def first_row(self, cell: Cell) -> int | None:
         """Return the first rollout of a cell."""
@@ -257,10 +254,6 @@ class RendererColumns(Side):
     def failure(self, row: int) -> str:
         """Return the failure class of a rollout."""
         return self.table.failure(int(self.rows[row]))
-
-    @cached_property
-    def _places(self) -> dict[int, I64]:
-        return {}
 
     @cached_property
     def _first_rows(self) -> I64:

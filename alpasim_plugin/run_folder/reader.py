@@ -21,7 +21,6 @@ from alpasim_plugin.io.reading import parsing, read_json_as, read_json_object
 from alpasim_plugin.run_folder.check import planned_cells
 from alpasim_plugin.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
-from alpasim_plugin.run_folder.scenes import SceneFile
 from alpasim_plugin.run_folder.schema import (
     AGAIN,
     CONTENTS,
@@ -38,7 +37,7 @@ from alpasim_plugin.run_folder.schema import (
     SUMMARY,
     metrics_in,
 )
-from alpasim_plugin.run_folder.shapes import RunInfo, Summary
+from alpasim_plugin.run_folder.shapes import RunInfo, SceneFile, Summary
 from alpasim_plugin.run_folder.writer import rollout_table
 
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
@@ -179,20 +178,17 @@ class Run:
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
         """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason, from the ledger or else the steps."""
-        found = self._step_reasons()
+        columns = ["renderer", "metric", "reason"]
+        table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
+        counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
+        rows = counts.to_pylist()  # ascending: the most frequent reason is written last
+        found = {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
         for renderer, ledger in (self.summary.get("censoring") or {}).items():
             for metric, entry in (ledger.get("invalid") or {}).items():
                 reasons = entry.get("reasons") or {}
                 if reasons:
                     found[renderer, metric] = max(reasons, key=lambda reason: reasons[reason])
         return found
-
-    def _step_reasons(self) -> dict[tuple[str, str], str]:
-        columns = ["renderer", "metric", "reason"]
-        table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
-        counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
-        rows = counts.to_pylist()  # ascending: the most frequent reason is written last
-        return {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
 
 
 RunT = TypeVar("RunT", bound=Run)

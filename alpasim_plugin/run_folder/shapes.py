@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.types import Aggregation, Direction
@@ -203,6 +204,62 @@ class Summary(TypedDict, total=False):
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
     plans: dict[str, dict[str, Any]]
+
+
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
+
+
+class DrawnLane(TypedDict, total=False):
+    """A lane in a scene's file."""
+
+    left: Line | None
+    right: Line | None
+    paint: Annotated[list[str], Field(min_length=2, max_length=2)]
+
+
+class DrawnDrive(TypedDict):
+    """The recorded drive in a scene's file."""
+
+    x_m: list[Coordinate]
+    y_m: list[Coordinate]
+
+
+class Body(TypedDict, total=False):
+    """The ego's body in a scene's file."""
+
+    length_m: Coordinate
+    width_m: Coordinate
+    rear_axle_to_centre_m: Coordinate
+
+
+class DrawnActor(TypedDict, total=False):
+    """A road user in a scene's file; tracks as recorded or scripted."""
+
+    id: str
+    label: str
+    static: bool
+    reacts: bool
+    length_m: Coordinate
+    width_m: Coordinate
+    t_us: list[int]
+    x_m: list[Coordinate]
+    y_m: list[Coordinate]
+    yaw_rad: list[Coordinate]
+
+
+class SceneFile(TypedDict, total=False):
+    """``scenes/SCENE.json``: what the bird's-eye view draws."""
+
+    scene_id: str
+    source: str
+    start_us: int
+    lanes: list[DrawnLane]
+    road_edges: list[Line]
+    crosswalks: list[Line]
+    ego_log: DrawnDrive
+    vehicle: Body
+    actors: list[DrawnActor]
 
 
 def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:

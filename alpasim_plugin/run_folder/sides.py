@@ -68,11 +68,6 @@ def is_ok(row: Row) -> bool:
     return bool(row.get("status", "ok") == "ok")
 
 
-def cell_of(row: Row) -> Cell:
-    """Return what identifies a rollout apart from its renderer."""
-    return str(row["policy"]), str(row["scene"]), int(row["seed"])
-
-
 class Side(ABC):
     """The rollouts of one renderer, laid out by cell: what every statistic over rollouts reads.
 
@@ -92,9 +87,18 @@ class Side(ABC):
     def raw(self, metric: str) -> F64:
         """Return the metric of every rollout ``(R,)``, NaN where it failed or the value is not valid or not finite."""
 
-    @abstractmethod
     def place_in(self, other: Side) -> I64:
         """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
+        if id(other) not in self._places:
+            self._places[id(other)] = self._placed(other)
+        return self._places[id(other)]
+
+    @cached_property
+    def _places(self) -> dict[int, I64]:
+        return {}
+
+    @abstractmethod
+    def _placed(self, other: Side) -> I64: ...
 
     @abstractmethod
     def first_row(self, cell: Cell) -> int | None:
@@ -139,7 +143,7 @@ class RendererRows(Side):
     @classmethod
     def of(cls, rows: Sequence[Row]) -> RendererRows:
         """Sort rows of one renderer."""
-        keys = [cell_of(row) for row in rows]
+        keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
         cells = tuple(sorted(set(keys)))
         place = {cell: i for i, cell in enumerate(cells)}
         scenes = {name: i for i, name in enumerate(sorted({c[1] for c in cells}))}
@@ -153,19 +157,12 @@ class RendererRows(Side):
 
     def raw(self, metric: str) -> F64:
         """Return the metric of every row; see `Side.raw`."""
-        if self._flat:
-            key = metric + VALID
-            found = np.array([row.get(metric) if row.get(key, True) else None for row in self.rows], dtype=np.float64)
-        else:
-            found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
+        found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
         return np.where(self.ok & np.isfinite(found), found, np.nan)
 
-    def place_in(self, other: Side) -> I64:
-        """Return each cell's index in the other side; see `Side.place_in`."""
-        if id(other) not in self._places:
-            place = {cell: i for i, cell in enumerate(other.cells)}
-            self._places[id(other)] = np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
-        return self._places[id(other)]
+    def _placed(self, other: Side) -> I64:
+        place = {cell: i for i, cell in enumerate(other.cells)}
+        return np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
 
     def first_row(self, cell: Cell) -> int | None:
         """Return the first row of a cell."""
@@ -180,19 +177,11 @@ class RendererRows(Side):
         return failure_of(self.rows[row])
 
     @cached_property
-    def _places(self) -> dict[int, I64]:
-        return {}
-
-    @cached_property
     def _first_rows(self) -> Mapping[Cell, int]:
         found: dict[Cell, int] = {}
         for i, c in enumerate(self.cell.tolist()):
             found.setdefault(self.cells[c], i)
         return found
-
-    @cached_property
-    def _flat(self) -> bool:
-        return not any(isinstance(row.get("metrics"), Mapping) for row in self.rows)
 
 
 def by_renderer(rows: Sequence[Row]) -> dict[str, RendererRows]:

@@ -1,4 +1,4 @@
-"""Write a run folder: be its only writer, remove what killed writers left, and write its tables from the rollouts' manifests."""
+"""Write a run folder: be its only writer, remove what killed writers left, write scenes, and tables from the rollouts' manifests."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.processes import is_running
-from alpasim_plugin.io.atomic import atomic_file, write_bytes
+from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
+from alpasim_plugin.io.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.io.lock import one_writer
-from alpasim_plugin.run_folder.schema import KEYS, LOCK, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_NAME, STEPS_TABLE, VALID
+from alpasim_plugin.run_folder.schema import KEYS, LOCK, ROLLOUTS, ROLLOUTS_TABLE, SCENES, STEPS, STEPS_NAME, STEPS_TABLE, VALID, slug
 
+ACTOR_STEP_US = 250_000
 GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
 CHUNK_ROWS = 4096  # rows that are held as dictionaries, which take ten times the memory
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp")  # as `alpasim_plugin.io.atomic.temporary_path` makes them
@@ -151,3 +156,89 @@ def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
                 writer.write_table(pa.concat_tables(held))
                 held, rows = [], 0
         writer.write_table(pa.concat_tables(held) if held else schema.empty_table())
+
+
+@dataclass(frozen=True)
+class LoggedScene:
+    """A scene that logs are scored against, with the facts that a report shows."""
+
+    scene: Scene
+    source: str
+    content_hash: str
+    notes: tuple[str, ...]
+    actors: Sequence[Actor]
+    world_origin: tuple[float, float, float]
+    start_us: int = 0
+    end_us: int = 0
+    warmup_us: int = 0
+
+
+def write_scene(root: Path, scenario: Scenario | LoggedScene) -> None:
+    """Write the file of a scene into a run folder."""
+    write_json(root / SCENES / f"{slug(scenario.scene.scene_id)}.json", scene_as_json(scenario))
+
+
+def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
+    """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a centimetre."""
+    scene, log = scenario.scene, scenario.scene.ego_log
+    lanes = [
+        {
+            "id": lane.lane_id,
+            "kind": lane.kind,
+            "centre": _xy(lane.centre),
+            "left": _xy(lane.left) if lane.left is not None else None,
+            "right": _xy(lane.right) if lane.right is not None else None,
+            "paint": [lane.left_paint, lane.right_paint],
+        }
+        for lane in scene.lane_map.lanes.values()
+    ]
+    keep = np.unique(np.linspace(0, len(log) - 1, min(len(log), 400)).astype(int))
+    return {
+        "scene_id": scene.scene_id,
+        "source": scenario.source,
+        "content_hash": scenario.content_hash,
+        "notes": list(scenario.notes),
+        "world_origin": list(scenario.world_origin),
+        "start_us": scenario.start_us,
+        "end_us": scenario.end_us,
+        "warmup_us": scenario.warmup_us,
+        "lanes": lanes,
+        "road_edges": [_xy(edge) for edge in scene.lane_map.road_edges],
+        "crosswalks": [_xy(ring) for ring in scene.lane_map.crosswalks],
+        "ego_log": {"t_us": log.t_us[keep].tolist()} | {f"{axis}_m": np.round(log.xyz[keep, i], 3).tolist() for i, axis in enumerate("xy")},
+        "vehicle": {
+            "length_m": scene.vehicle.box.length_m,
+            "width_m": scene.vehicle.box.width_m,
+            "rear_axle_to_centre_m": scene.vehicle.rear_axle_to_centre_m,
+        },
+        "actors": [_actor(scenario, actor) for actor in scenario.actors],
+    }
+
+
+def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
+    """Return what a drawing needs of a road user: its size, and its track every `ACTOR_STEP_US` while the scene runs."""
+    track = actor.track
+    is_timed = scenario.end_us > scenario.start_us  # a scene that logs are scored against need not say when it runs
+    inside = np.flatnonzero((track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us)) if is_timed else np.arange(len(track))
+    if actor.is_static:
+        inside = inside[:1] if len(inside) else np.array([0])
+    step = max(1, round(ACTOR_STEP_US / max(1.0, float(np.median(np.diff(track.t_us)))))) if len(track) > 1 else 1
+    keep = np.unique(np.concatenate([inside[::step], inside[-1:]]))
+    yaw = yaw_from_quat(track.quat[keep])
+    return {
+        "id": actor.actor_id,
+        "label": actor.label,
+        "static": actor.is_static,
+        "reacts": actor.behaviour.kind != "replay",
+        "length_m": actor.box.length_m,
+        "width_m": actor.box.width_m,
+        "t_us": track.t_us[keep].tolist(),
+        "x_m": np.round(track.xyz[keep, 0], 2).tolist(),
+        "y_m": np.round(track.xyz[keep, 1], 2).tolist(),
+        "yaw_rad": np.round(yaw, 3).tolist(),
+    }
+
+
+def _xy(line: F64) -> list[list[float]]:
+    rounded: list[list[float]] = np.round(line[:, :2], 2).tolist()
+    return rounded

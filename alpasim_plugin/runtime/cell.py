@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,15 +15,15 @@ import cv2
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.errors import PolicyError, SimrunError
-from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.io.atomic import disk_error
 from alpasim_plugin.plugins.interfaces import Policy, Renderer
-from alpasim_plugin.plugins.parts import build, complete
+from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.process.stdout import parts_print_to_stderr
 from alpasim_plugin.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest
 from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME
 from alpasim_plugin.run_folder.writer import write_steps
-from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
@@ -239,3 +239,42 @@ def _closing(part: Policy | Controller | RemoteActors) -> Iterator[None]:
 @lru_cache(maxsize=4)
 def _scenario(ref: ScenarioRef) -> Scenario:
     return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+
+
+def make_renderer(
+    name: str | RendererSpec,
+    scenario: Scenario,
+    seed: int = 0,
+    device: str = "cpu",
+    threads: int | None = None,
+    overrides: Sequence[str] = (),
+) -> Renderer:
+    """Build one rollout's renderer.
+
+    Args:
+        name: A renderer, or a fixer over one, as `alpasim_plugin.plugins.parts.resolve_renderer` takes it; or its resolved spec.
+        scenario: What is rendered.
+        seed: The rollout's seed, for temporal noise and the fixer's noise.
+        device: ``cpu`` or ``cuda``.
+        threads: Threads of the CPU rasteriser and of torch; None keeps their settings.
+        overrides: ``KEY=VALUE`` of the fixer's settings, where ``name`` is a string.
+
+    Raises:
+        InputError: Unknown name, device or setting, or weights that are missing or wrong.
+        RendererError: The device does not work.
+    """
+    spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
+    session = {"seed": seed, "device": device, "threads": threads}
+    base: Renderer = build(spec.base, scenario=scenario, **session)
+    if spec.fixer is None:
+        return base
+    from alpasim_plugin.fixers.loop import fixed_renderer
+    from alpasim_plugin.fixers.settings import FixerSettings
+
+    fixer, settings = spec.fixer, spec.fixer.settings
+    assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
+
+    def render(request: RenderRequest) -> Frame:
+        return checked_frames(base, [request])[0]
+
+    return fixed_renderer(render, lambda: build(fixer, scene_id=scenario.scene_id, **session), settings, scenario, threads)

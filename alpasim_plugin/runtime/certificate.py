@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError, SimrunError
 from alpasim_plugin.io.atomic import scratch_folder
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Key, digests, first_difference, sha256, trace_log
@@ -39,9 +39,9 @@ def certify(
         before: The folder's earlier certificate; it is kept if it certifies the same rollout and the same log.
 
     Returns:
-        ``status`` (equal, different, skipped), ``reason`` where skipped, ``cell``, ``path``, ``rollout_key``, ``score_key``, ``steps``,
-        ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout), ``repeated`` (those of the repeat),
-        ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
+        ``status`` (equal, different, skipped), ``reason`` where skipped, ``error`` (its four parts) where the repeat failed, ``cell``,
+        ``path``, ``rollout_key``, ``score_key``, ``steps``, ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout),
+        ``repeated`` (those of the repeat), ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
     """
     if mode == "none":
         return {"status": "skipped", "reason": "switched off with --certify none"}
@@ -62,7 +62,12 @@ def certify(
     }
     if before and before.get("status") == "equal" and all(before.get(key) == value for key, value in facts.items()):
         return dict(before)
-    return facts | _repeat(plan, cell, root, manifest, threads, log_sha256)
+    began = time.perf_counter()
+    try:
+        found = _repeat(plan, cell, root, manifest, threads, log_sha256)
+    except SimrunError as error:  # the run is driven and scored: its tables and reports must not be lost with the repeat
+        found = _skipped(error.as_dict())
+    return facts | found | {"wall_s": round(time.perf_counter() - began, 3)}
 
 
 def certificate_line(certificate: Mapping[str, Any]) -> str:
@@ -82,21 +87,11 @@ def certificate_line(certificate: Mapping[str, Any]) -> str:
 
 
 def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], threads: int, log_sha256: str) -> dict[str, Any]:
-    began = time.perf_counter()
     # In the run folder, under a name that the next run removes if this process is killed.
     with scratch_folder(root / "repeat", "repeating a rollout") as scratch:
         again = run_cell(cell, plan.options, scratch, threads)
         if again["status"] != "ok":
-            error = again["error"]
-            if error["failure_class"] == InfrastructureError.failure_class:  # a full disk says nothing about the rollout
-                raise InfrastructureError(error["doing"], error["with"], error["found"], error["do"])
-            found = f"the repeat failed: {again['error']['found']}"
-            verdict: dict[str, Any] = {
-                "status": "different",
-                "repeated": {},
-                "first_difference": {"component": "run", "t_us": None, "step": None, "what": found},
-            }
-            return verdict | {"digests": {}, "wall_s": round(time.perf_counter() - began, 3)}
+            return _not_repeated(again["error"])
         one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(scratch / cell.folder, again)
         same_bytes = sha256((scratch / cell.folder / LOG_NAME).read_bytes()) == log_sha256
     scenario = plan.scenarios[cell.scene]
@@ -104,13 +99,21 @@ def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], 
     first = None if difference is None else difference.as_dict()
     if first is None and not same_bytes:
         first = {"component": "log", "t_us": None, "step": None, "what": "an entry that belongs to no component"}
-    return {
-        "status": "equal" if first is None else "different",
-        "digests": digests(one),
-        "repeated": digests(other),
-        "first_difference": first,
-        "wall_s": round(time.perf_counter() - began, 3),
-    }
+    status = "equal" if first is None else "different"
+    return {"status": status, "digests": digests(one), "repeated": digests(other), "first_difference": first}
+
+
+def _not_repeated(error: Mapping[str, str]) -> dict[str, Any]:
+    """Return the certificate of a repeat that ended with an error; one of the machine or of a service says nothing about the rollout."""
+    if error["failure_class"] == InfrastructureError.failure_class:
+        return _skipped(error)
+    first = {"component": "run", "t_us": None, "step": None, "what": f"the repeat failed: {error['found']}"}
+    return {"status": "different", "digests": {}, "repeated": {}, "first_difference": first, "error": dict(error)}
+
+
+def _skipped(error: Mapping[str, str]) -> dict[str, Any]:
+    reason = f"the repeat failed: {error['doing']}, {error['with']}: {error['found']}"
+    return {"status": "skipped", "reason": reason, "error": dict(error)}
 
 
 def log_trace(folder: Path) -> dict[str, dict[Key, str]]:

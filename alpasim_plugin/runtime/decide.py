@@ -72,16 +72,12 @@ class Design:
         max_missing: Share of pairs of a metric that may lack.
     """
 
-    order: Annotated[
-        Order, Flag("With --population suite, stratified: between looks every family of scenes in proportion.")
-    ] = "random"
+    order: Annotated[Order, Flag("With --population suite, stratified: between looks every family of scenes in proportion.")] = "random"
     order_seed: Annotated[int, Flag("Key of the order of scenes.", min=0)] = 0
     look_every: Annotated[int, Flag("Scenes between looks.", min=1)] = 5
     budget: Annotated[int | None, Flag("Most rollouts; then undecided. Default: all of the suite.", min=2)] = None
     auto_seeds: bool = False
-    scene_cost: Annotated[
-        float, Flag("What a new scene costs (a reconstruction, say), in pairs of rollouts.", min=0.0)
-    ] = 0.0
+    scene_cost: Annotated[float, Flag("What a new scene costs (a reconstruction, say), in pairs of rollouts.", min=0.0)] = 0.0
     max_failed: float = 0.0
     max_missing: Annotated[float, Flag("Share of pairs that may lack a value.", min=0.0, max=0.99)] = 0.0
 

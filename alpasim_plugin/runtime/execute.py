@@ -25,16 +25,14 @@ from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.run_folder.manifests import write_manifest
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
-from alpasim_plugin.runtime.executors.assignment import assignment_as_here, targets_of
+from alpasim_plugin.runtime.commits import KnownCommits, opened, run_stored_cell, unpack
+from alpasim_plugin.runtime.executors.assignment import assignment_as_here, measured_folder, targets_of
 from alpasim_plugin.runtime.executors.base import Lost
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_backend
 from alpasim_plugin.runtime.executors.local import run_in_processes, run_or_retry
-from alpasim_plugin.runtime.executors.node_files import measured_folder
 from alpasim_plugin.runtime.executors.pool import run_jobs
-from alpasim_plugin.runtime.executors.result import unpack
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.provenance import hardware
-from alpasim_plugin.runtime.stores.commits import KnownCommits, opened, run_stored_cell
 
 KERNELS = "kernels"
 SUBJECTS = {  # subject -> tiny case, imported in the process that compiles

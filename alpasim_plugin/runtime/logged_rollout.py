@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,7 @@ from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts import overrides_of, resolve_renderer
 from alpasim_plugin.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, RUN_INFO, cell_name
-from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan, refuse_commands
-from scenarios.suite import ScenarioRef
+from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan, options_of, ref_of, refuse_commands
 
 DOING = "finding a logged rollout"
 
@@ -81,8 +80,8 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
     where = scenario or stated.get("path")
     if where is None:
         raise InputError(DOING, f"{root / RUN_INFO}", "it has no path of the scenario", "name it with --scenario PATH")
-    ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())), stated.get("source"))
-    options = _options(info)
+    ref = ref_of({**stated, "path": where})
+    options = replace(options_of(info), baseline=None, video="none")
     refuse_commands([row["policy"]], DOING, str(root))
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a fixer.
     has_fixer = resolve_renderer(row["renderer"], options.fixer).fixer is not None
@@ -99,13 +98,6 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
             "run the rollout again, or name its scenario with --scenario PATH",
         )
     return LoggedRollout(root, cell, options, loaded, manifest)
-
-
-def _options(info: Mapping[str, Any]) -> RunOptions:
-    """Return the options of an earlier run."""
-    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
-    listed = {key: tuple(stated.get(key, ())) for key in ("fixer", "evaluators")}
-    return RunOptions(**stated | {"baseline": None, "video": "none"} | listed)
 
 
 def _row(root: Path, name: str) -> dict[str, Any]:

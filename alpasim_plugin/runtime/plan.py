@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,6 +37,17 @@ class RunOptions:
     controller: Annotated[str | None, Flag("Controller that tracks the plans; by default the policy's.", names="controller")] = None
     evaluators: Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")] = ()
     traffic: Annotated[str | None, Flag("AlpaSim's traffic service moves the other road users.", metavar="HOST:PORT")] = None
+
+
+def options_of(info: Mapping[str, Any]) -> RunOptions:
+    """Return the options of an earlier run, as its ``run.json`` states them."""
+    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
+    return RunOptions(**stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")})
+
+
+def ref_of(stated: Mapping[str, Any]) -> ScenarioRef:
+    """Return how a scenario was named when it was driven, as ``run.json`` states it in a scene's ``ref``."""
+    return ScenarioRef(stated["path"], stated.get("seed"), tuple(stated.get("overrides") or ()), stated.get("source"))
 
 
 @dataclass(frozen=True)

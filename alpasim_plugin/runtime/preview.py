@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,18 +18,23 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
-from alpasim_plugin.core.types import F64, U8, Actor, RenderRequest, Scenario
+from alpasim_plugin.core.geometry import interpolate, yaw_of
+from alpasim_plugin.core.types import F64, U8, Actor, Box, RenderRequest, Scenario, Trajectory
 from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.renderers.background import background_note
-from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.run_folder.writer import scene_as_json
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
+from alpasim_plugin.viewer.drive_data import drawn_map, recorded_drive
+from evaluators.report.birdseye import chord_angle, corners
+
+Flatten = Callable[[F64], F64]  # (N, 2 or 3) metres, world -> (N, 2) metres on the page
 
 DOING = "previewing a scenario"
 MARGIN_M = 15.0
 MAX_HEIGHT, MIN_HEIGHT = 5.0, 1.6  # of the map, inches
 WIDTH = 13.0
-ROAD, PAINT, EDGE, EGO = "#d7dadd", "#ffffff", "#7d858c", "#0b6bb3"
+ROAD, PAINT, CROSSWALK, EDGE, EGO = "#d7dadd", "#ffffff", "#c3c8cd", "#7d858c", "#0b6bb3"
 OTHERS = ("#c2540a", "#00806a", "#9a4f8f", "#8a6a00", "#b3344a", "#3f51b5", "#5b6470")
 
 
@@ -125,34 +130,29 @@ def window(low: F64, high: F64, height_per_width: float) -> tuple[F64, F64]:
 
 
 def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], images: Sequence[U8], facts: Sequence[str]) -> bytes:
-    start = interpolate(scenario.ego_log, np.array([times[0], times[-1]]))[:, :2, 3]
-    chord = start[1] - start[0]
-    turn = np.arctan2(chord[1], chord[0]) if np.hypot(*chord) > 1.0 else yaw_of(interpolate(scenario.ego_log, np.array([times[0]]))[0])
+    content, log = scene_as_json(scenario), scenario.ego_log
+    recorded = recorded_drive(content, scenario.scene_id)
+    turn = chord_angle(recorded)
     c, s = np.cos(turn), np.sin(turn)
     flat = np.array([[c, s], [-s, c]])  # world to page: the drive runs from left to right
 
     def place(xy: F64) -> F64:
-        return np.asarray((xy[:, :2] - start[0]) @ flat.T)
+        return np.asarray((xy[:, :2] - recorded[0]) @ flat.T)
 
-    log = scenario.ego_log
-    inside = (log.t_us >= scenario.start_us) & (log.t_us <= scenario.end_us)
-    driven = place(log.xyz[inside])
+    driven = place(log.xyz[(log.t_us >= times[0]) & (log.t_us <= times[-1])])
     low, high = driven.min(axis=0) - MARGIN_M, driven.max(axis=0) + MARGIN_M
     map_height = float(np.clip(WIDTH * (high[1] - low[1]) / (high[0] - low[0]), MIN_HEIGHT, MAX_HEIGHT))
     strip_height = WIDTH / len(images) * images[0].shape[0] / images[0].shape[1] + 0.3
-    text_height = 0.22 * len(facts) + 0.2
-    height = map_height + strip_height + text_height
+    height = map_height + strip_height + 0.22 * len(facts) + 0.2
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(WIDTH, height), dpi=100)
         for row, line in enumerate(facts):
             figure.text(0.01, 1 - (0.2 + 0.22 * row) / height, line[:190], va="center", weight="bold" if row == 0 else "normal")
         axes = figure.add_axes((0.0, strip_height / height, 1.0, map_height / height))
-        _draw_road(axes, scenario, place)
-        _draw_users(axes, scenario, there, times, place, turn)
+        _draw_road(axes, {kind: [place(line) for line in lines] for kind, lines in drawn_map(content).items()})
+        _draw_users(axes, scenario, there, times, place)
         (x0, y0), (x1, y1) = window(low, high, map_height / WIDTH)
-        axes.set_xlim(x0, x1)
-        axes.set_ylim(y0, y1)
-        axes.set_aspect("equal")
+        axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
         axes.set_axis_off()
         for k, (t_us, image) in enumerate(zip(times, images, strict=True)):
             cell = figure.add_axes((k / len(images) + 0.002, 0.0, 1 / len(images) - 0.004, (strip_height - 0.28) / height))
@@ -164,42 +164,42 @@ def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], im
     return buffer.getvalue()
 
 
-def _draw_road(axes: Axes, scenario: Scenario, place: Any) -> None:
-    lanes = [lane for lane in scenario.lane_map.lanes.values() if lane.left is not None and lane.right is not None]
-    rings = [np.concatenate([place(lane.left), place(lane.right)[::-1]]) for lane in lanes]
-    axes.add_collection(PolyCollection(rings, facecolor=ROAD, edgecolor="none", zorder=1))
-    painted = [
-        place(line) for lane in lanes for line, paint in ((lane.left, lane.left_paint), (lane.right, lane.right_paint)) if paint != "none"
-    ]
-    axes.add_collection(LineCollection(painted, colors=PAINT, linewidths=1.0, zorder=2))
-    axes.add_collection(LineCollection([place(edge) for edge in scenario.lane_map.road_edges], colors=EDGE, linewidths=1.1, zorder=2))
+def _draw_road(axes: Axes, lines: Mapping[str, Sequence[F64]]) -> None:
+    axes.add_collection(PolyCollection(lines["lanes"], facecolor=ROAD, edgecolor="none", zorder=1))
+    axes.add_collection(PolyCollection(lines["crosswalks"], facecolor=CROSSWALK, edgecolor="none", zorder=2))
+    axes.add_collection(LineCollection(lines["paint"], colors=PAINT, linewidths=1.0, zorder=2))
+    axes.add_collection(LineCollection(lines["edges"], colors=EDGE, linewidths=1.1, zorder=2))
 
 
-def _draw_users(axes: Axes, scenario: Scenario, there: Sequence[Actor], times: Sequence[int], place: Any, turn: float) -> None:
+def _draw_users(axes: Axes, scenario: Scenario, there: Sequence[Actor], times: Sequence[int], place: Flatten) -> None:
     """Draw ways as lines and bodies at each moment, later ones darker; the ego last."""
-    log, vehicle = scenario.ego_log, scenario.vehicle
-    shades = np.linspace(0.25, 0.95, len(times))
+    moments = list(zip(times, np.linspace(0.25, 0.95, len(times)).tolist(), strict=True))
+
+    def draw_way(track: Trajectory, colour: str) -> None:
+        inside = (track.t_us >= times[0]) & (track.t_us <= times[-1])
+        axes.plot(*place(track.xyz[inside]).T, color=colour, linewidth=1.2, zorder=3)
+
     for k, actor in enumerate(there):
-        colour = OTHERS[k % len(OTHERS)]
-        inside = (actor.track.t_us >= times[0]) & (actor.track.t_us <= times[-1])
-        if not actor.is_static and inside.sum() > 1:
-            axes.plot(*place(actor.track.xyz[inside]).T, color=colour, linewidth=1.0, alpha=0.8, zorder=3)
-        for t_us, shade in zip(times[-1:] if actor.is_static else times, shades[-1:] if actor.is_static else shades, strict=True):
-            if actor.is_static or actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]:
-                at = int(np.clip(t_us, actor.track.t_us[0], actor.track.t_us[-1]))
-                pose = interpolate(actor.track, np.array([at]))[0]
-                _body(axes, place(pose[None, :3, 3])[0], yaw_of(pose) - turn, (actor.box.length_m, actor.box.width_m), colour, shade)
-    inside = (log.t_us >= times[0]) & (log.t_us <= times[-1])
-    axes.plot(*place(log.xyz[inside]).T, color=EGO, linewidth=1.6, zorder=5)
-    for t_us, shade in zip(times, shades, strict=True):
-        pose = interpolate(log, np.array([t_us]))[0]
-        centre = pose[:3, 3] + pose[:3, 0] * vehicle.rear_axle_to_centre_m
-        _body(axes, place(centre[None])[0], yaw_of(pose) - turn, (vehicle.box.length_m, vehicle.box.width_m), EGO, shade)
+        first, last = int(actor.track.t_us[0]), int(actor.track.t_us[-1])
+        seen = [(t, shade) for t, shade in moments if first <= t <= last]
+        if actor.is_static:
+            seen = [(int(np.clip(times[-1], first, last)), moments[-1][1])]
+        draw_way(actor.track, OTHERS[k % len(OTHERS)])
+        _draw_bodies(axes, actor.track, actor.box, 0.0, seen, place, OTHERS[k % len(OTHERS)])
+    vehicle = scenario.vehicle
+    draw_way(scenario.ego_log, EGO)
+    _draw_bodies(axes, scenario.ego_log, vehicle.box, vehicle.rear_axle_to_centre_m, moments, place, EGO)
 
 
-def _body(axes: Axes, at: F64, yaw: float, size: tuple[float, float], colour: str, shade: float) -> None:
-    corners = rectangle_corners(at[None], np.array([yaw]), np.array([size]))[0]
-    axes.add_collection(PolyCollection([corners], facecolor=colour, edgecolor=colour, alpha=shade, linewidth=0.8, zorder=6))
+def _draw_bodies(
+    axes: Axes, track: Trajectory, box: Box, ahead_m: float, moments: Sequence[tuple[int, float]], place: Flatten, colour: str
+) -> None:
+    """Draw a body at moments (time, shade), with its centre so far ahead of the poses of its track."""
+    for t_us, shade in moments:
+        pose = interpolate(track, np.array([t_us]))[0]
+        centre = pose[:2, 3] + pose[:2, 0] * ahead_m
+        body = place(corners(centre, yaw_of(pose), box.length_m, box.width_m))
+        axes.add_collection(PolyCollection([body], facecolor=colour, edgecolor=colour, alpha=shade, linewidth=0.8, zorder=6))
 
 
 def _page(scenario: Scenario, png: bytes, facts: Sequence[str]) -> bytes:

@@ -175,7 +175,9 @@ def _pair(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair
     n, first, first_gap = len(queries), None, None
     gap, turn, levels = np.full((n, len(HORIZONS_S)), np.nan), np.full((n, len(HORIZONS_S)), np.nan), np.zeros(n)
     for row, query in enumerate(queries):
-        a, b = (_trajectory(query.plans[name]) for name in (reference, renderer))
+        # Plans as rig poses in the frame of the query, which all renderers share.
+        plans = [query.plans[name] for name in (reference, renderer)]
+        a, b = (Trajectory(p.times_us, np.column_stack([p.xy, np.zeros(len(p.times_us))]), quat_from_yaw(p.yaw)) for p in plans)
         end_us = min(query.t_us + HORIZON_US, int(a.t_us[-1]), int(b.t_us[-1]))
         distances, turns = plan_gap(a, b, [*(query.t_us + round(h * 1e6) for h in HORIZONS_S), end_us])
         gap[row], turn[row] = distances[:-1], turns[:-1]
@@ -184,11 +186,6 @@ def _pair(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair
         images = (query.frames[name].rgb.astype(np.int16) for name in (reference, renderer))
         levels[row] = float(np.mean(np.abs(np.subtract(*images))))
     return Pair(reference, renderer, gap, turn, levels, first, first_gap)
-
-
-def _trajectory(plan: Plan) -> Trajectory:
-    """Return a plan as rig poses in the frame of the query, which all renderers share."""
-    return Trajectory(plan.times_us, np.column_stack([plan.xy, np.zeros(len(plan.times_us))]), quat_from_yaw(plan.yaw))
 
 
 def summarise(pair: Pair, queries: Sequence[PolicyQuery], start_us: int) -> dict[str, Any]:

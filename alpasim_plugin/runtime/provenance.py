@@ -84,7 +84,9 @@ def project(folder: Path | None = None) -> Project:
     """
     stated = os.environ.get(VARIABLE, "").strip().lower()
     if stated:
-        return _stated(stated) if _COMMIT.fullmatch(stated) else _without(f"{VARIABLE} is no commit: {stated[:40]!r}")
+        if not _COMMIT.fullmatch(stated):
+            return _without(f"{VARIABLE} is no commit: {stated[:40]!r}")
+        return {"commit": stated, "committed_at": None, "branch": None, "dirty": None, "reason": ""}
     try:
         last = _git(folder, "log", "-1", "--format=%H %cI")
         state = _git(folder, "status", "--porcelain=v2", "--branch", "--untracked-files=no")
@@ -102,10 +104,6 @@ def project(folder: Path | None = None) -> Project:
     return {
         "commit": commit, "committed_at": committed_at, "branch": None if branch == "(detached)" else branch, "dirty": dirty, "reason": "",
     }  # fmt: skip
-
-
-def _stated(commit: str) -> Project:
-    return {"commit": commit, "committed_at": None, "branch": None, "dirty": None, "reason": ""}
 
 
 def _without(reason: str) -> Project:

@@ -1,4 +1,4 @@
-"""Writes the files of one rollout: the log, per-frame facts and images; collects stage times."""
+"""Writes the files of one rollout: the log, per-frame facts, a strip of frames and on request a video; collects stage times."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.plan_check import unit_guess
 from alpasim_plugin.core.types import (
     F64,
+    U8,
     CameraSpec,
     EgoState,
     Frame,
@@ -30,12 +31,12 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
-from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
 from alpasim_plugin.log.session import session_uuid
 from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.runtime.loop_state import PathEnd
-from alpasim_plugin.runtime.pictures import Pictures
 from alpasim_plugin.world.ego import ego_states_from_log
 
 REACH_S = 1.0
@@ -294,7 +295,7 @@ class Recorder:
             "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
-            "strip_t_us": [] if self._pictures is None else self._pictures.strip_us,
+            "strip_t_us": [] if self._pictures is None else [t_us for t_us, _ in self._pictures.strip()],
         }
 
     def save_pictures(self, video: bool) -> None:
@@ -307,3 +308,41 @@ class Recorder:
         if self._writer is None:
             raise RuntimeError("Recorder.start was not called")
         return self._writer
+
+
+STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, as fractions of the rollout
+
+
+class Pictures:
+    """Collects the frames of the strip and of the video.
+
+    Args:
+        clock: The rollout's clock.
+        camera: Name of the camera.
+        all_frames: Keep every frame for a video, not only those of the strip.
+    """
+
+    def __init__(self, clock: Clock, camera: str, all_frames: bool) -> None:
+        self._camera, self._all, self._period_us = camera, all_frames, clock.rates.camera_us
+        self._strip_us = [clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us for fraction in STRIP_FRACTIONS]
+        self._kept: list[tuple[int, U8]] = []
+
+    def add(self, frame: Frame) -> None:
+        """Keep a frame that the strip or the video needs."""
+        if frame.camera == self._camera and (self._all or self._in_strip(frame.t_us)):
+            self._kept.append((frame.t_us, frame.rgb))
+
+    def save(self, folder: Path, video: bool) -> None:
+        """Write the strip, and the video if requested; nothing for a rollout without frames."""
+        strip = [rgb for _, rgb in self.strip()]
+        if strip:
+            write_bytes(folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90))
+        if video and self._kept:
+            write_mp4(folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._period_us)
+
+    def _in_strip(self, t_us: int) -> bool:
+        return any(abs(t_us - at_us) * 2 < self._period_us for at_us in self._strip_us)
+
+    def strip(self) -> list[tuple[int, U8]]:
+        """Return times and pixels of the strip's frames."""
+        return [(t_us, rgb) for t_us, rgb in self._kept if self._in_strip(t_us)]

@@ -6,7 +6,7 @@ Only the current block is held in memory. The result is renamed to its final nam
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,7 +17,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, U8, Frame
-from alpasim_plugin.fixers.refine import ChangeLimit, FixedBlock, StreamStats, refine_frames
+from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.picture_folder import PictureFolderReader, PictureFolderWriter
 from alpasim_plugin.log.video_reader import TimedFrame, VideoFormat, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
@@ -137,19 +137,15 @@ def refine_video(
             stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer, limit):
-            _write_block(writers, timing, block)
+            for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
+                writers["output"].write(fixed.rgb, timed.time, timed.duration)
+                if "compare" in writers:
+                    writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
             timing.clear()
             stats.add(block)
             if on_frames is not None:
                 on_frames(stats.frames, source.frames)
     return _summary(fixer, source, stats, time.perf_counter() - begin)
-
-
-def _write_block(writers: Mapping[str, Writer], timing: Sequence[TimedFrame], block: FixedBlock) -> None:
-    for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
-        writers["output"].write(fixed.rgb, timed.time, timed.duration)
-        if "compare" in writers:
-            writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
 
 
 def _summary(fixer: Fixer, source: VideoFormat, stats: StreamStats, wall_s: float) -> RefineSummary:

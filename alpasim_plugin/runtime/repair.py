@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.run_folder.check import Inspection, inspect_run
-from alpasim_plugin.run_folder.repair import command_of, prepare_reading, restore_run
+from alpasim_plugin.run_folder.check import Inspection, command_of, inspect_run, prepare_reading, restore_run
 from alpasim_plugin.run_folder.schema import DOING, REPORTS, RUN_INFO
 from alpasim_plugin.run_folder.writer import writing
 from alpasim_plugin.runtime.certificate import Certify
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, refuse_commands
+from alpasim_plugin.runtime.plan import RunPlan, make_plan, options_of, ref_of, refuse_commands
 from alpasim_plugin.runtime.run import Progress, execute_run, finish_run
-from scenarios.suite import ScenarioRef
 
 
 def use_run(root: Path, say: Callable[[str], None]) -> None:
-    """Check a run folder before its tables are read; see `alpasim_plugin.run_folder.repair.prepare_reading`."""
+    """Check a run folder before its tables are read; see `alpasim_plugin.run_folder.check.prepare_reading`."""
     prepare_reading(root, say, remake_tables)
 
 
@@ -56,8 +54,8 @@ def repair_run(found: Inspection, workers: int | None, progress: Progress, wait:
     if plan.content != found.info.get("content"):
         now = "the scenario, a part or the version has changed since the run: new rollouts would not be comparable with the old ones"
         raise InputError("repairing a run", str(found.root), now, f"run everything again: {command_of(found)}")
-    skipped = (found.info.get("determinism") or {}).get("status") == "skipped"
-    certificate: Certify = "none" if skipped else "one"
+    before = found.info.get("determinism") or {}
+    certificate: Certify = "none" if before.get("status") == "skipped" and "error" not in before else "one"
     report = (found.root / REPORTS[0]).exists()
     execute_run(plan, found.root, workers, found.info["command"], progress, True, certificate, report, wait=wait, full=True)
 
@@ -68,14 +66,12 @@ def plan_of_run(info: Mapping[str, Any]) -> RunPlan:
     Raises:
         InputError: A scenario or a part is not there any more.
     """
-    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
-    options = RunOptions(**stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")})
     refs = []
     for name, scene in info["scenes"].items():
         ref = scene.get("ref")
         if not isinstance(ref, dict) or not isinstance(ref.get("path"), str):
             raise InputError("repairing a run", RUN_INFO, f"it has no path of the scenario {name}", "give the command of the run again")
-        refs.append(ScenarioRef(ref["path"], ref.get("seed"), tuple(ref.get("overrides") or ()), ref.get("source")))
+        refs.append(ref_of(ref))
     refuse_commands(info["policies"], "repairing a run", RUN_INFO)
-    plan = make_plan(refs, info["renderers"], info["policies"], info["seeds"], options)
+    plan = make_plan(refs, info["renderers"], info["policies"], info["seeds"], options_of(info))
     return replace(plan, asked=tuple(info.get("asked") or ()))

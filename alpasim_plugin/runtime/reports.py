@@ -1,11 +1,25 @@
-"""The reports of a run folder, written together."""
+"""The reports of a run folder, written together, and what they show of outcomes that flipped."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
-from alpasim_plugin.run_folder.schema import PAGES
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.io.atomic import write_bytes, write_json
+from alpasim_plugin.log import decode_image, encode_image, read_asl
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, probe_folder
+from alpasim_plugin.viewer.page import write_flips_page
+from alpasim_plugin.viewer.pictures import smaller
+from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
+from evaluators.opening import read_run
+from evaluators.report import write_junit, write_report, write_summary_md
+from evaluators.report.flips import FLIPS_NAME, Flip, find_flips
 
 Key = tuple[str, str, str, int]  # renderer, policy, scene, seed
 
@@ -19,14 +33,8 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
         page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an earlier command are removed, and None is
             returned.
     """
-    # Plotting libraries take a second to load, and a run needs them only now.
-    from evaluators.report import write_junit, write_report, write_summary_md
-
     replays: Mapping[Key, str] = {}
     if flips and page:
-        from alpasim_plugin.runtime.flips import write_flips
-        from alpasim_plugin.viewer.write import write_flips_page
-
         write_flips(root)
         replays = write_flips_page(root)
     write_summary_md(root)
@@ -36,3 +44,80 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
     for name in PAGES:
         (root / name).unlink(missing_ok=True)
     return None
+
+
+MAX_FLIPS = 60  # cells whose logs are read
+PICTURE_WIDTH = 560
+
+
+def write_flips(root: Path) -> Path:
+    """Find the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
+
+    A probe of the same cell and renderers is used where it exists: it renders both at identical poses. Otherwise the two logs are compared;
+    their poses are equal until the plans diverge.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(root)
+    flips, compared = find_flips(run)
+    cells = []
+    for number, flip in enumerate(flips[:MAX_FLIPS]):
+        key = {"renderer": flip.other.renderer, "policy": flip.other.policy, "scene": flip.other.scene, "seed": flip.other.seed}
+        cells.append(key | {"baseline": flip.base.renderer} | _divergence(root, flip, f"flips/{number:03d}"))
+    _read.cache_clear()
+    about = {"threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "n_flips": len(flips), "n_pairs": compared}
+    write_json(root / FLIPS_NAME, about | {"cells": cells})
+    return root / FLIPS_NAME
+
+
+def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
+    probe = find_probe(root, flip.base, flip.other.renderer)
+    if probe is not None:
+        return dict(probe) | {"source": "probe"}
+    try:
+        logs = {r.renderer: _read(root / r.path / LOG_NAME) for r in (flip.base, flip.other)}
+    except SimrunError as error:
+        return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
+    one, other = logs.values()
+    if not one.plans or not other.plans:
+        return {"t_us": None, "reason": "a log without plans"}
+    found = first_divergence(one.plans, other.plans)
+    if found is None:
+        return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
+    divergence: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
+    frames = {renderer: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (renderer, log) in enumerate(logs.items())}
+    if None in frames.values():
+        divergence["frames_reason"] = "a log without camera images (--images none, or a policy without cameras)"
+    return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {r: path for r, path in frames.items() if path}}
+
+
+def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:
+    """Return the first divergence that a probe along a rollout found between its renderer and another; None without such a probe."""
+    for path in sorted((root / probe_folder(*driven.cell)).glob(f"*/{PROBE_JSON}")):
+        for pair in read_json(path)["pairs"]:
+            if pair["reference"] == driven.renderer and pair["renderer"] == other:
+                first = pair["first_divergence"]
+                if first is None:
+                    return {"t_us": None, "reason": "a probe at identical poses found no divergence"}
+                frames = {r: (path.parent / name).relative_to(root).as_posix() for r, name in first["frames"].items()}
+                return dict(first) | {"frames": frames}
+    return None
+
+
+def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
+    """Save the first camera's newest frame at a query and return its path; None where the log has none."""
+    if not log.images:
+        return None
+    camera = log.images[0].camera
+    shown = [image for image in log.images if image.camera == camera and image.end_us <= t_us]
+    if not shown:
+        return None
+    rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
+    write_bytes(root / name, encode_image(smaller(rgb, PICTURE_WIDTH), "jpeg", 85))
+    return name
+
+
+@lru_cache(maxsize=4)  # flips of several renderers share the baseline's log
+def _read(path: Path) -> RolloutLog:
+    return read_asl(path)

@@ -26,17 +26,15 @@ from alpasim_plugin.run_folder.manifests import (
     write_run_json,
 )
 from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.run_folder.scenes import write_scene
 from alpasim_plugin.run_folder.schema import CONTENTS, REPORTS, RUN_INFO, SUMMARY, TABLES, slug
-from alpasim_plugin.run_folder.writer import writing
+from alpasim_plugin.run_folder.writer import write_scene, writing
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.certificate import Certify, certify
+from alpasim_plugin.runtime.commits import opened
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
-from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.runtime.stores.commits import opened
 from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
@@ -166,6 +164,8 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
         more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made again.
         report: Write ``report.html``.
     """
+    from alpasim_plugin.runtime.reports import write_reports  # plotting libraries take a second to load, and a run needs them only now
+
     info = read_run_json(root)
     outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
     write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})

@@ -15,15 +15,13 @@ from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.plugins.parts import PartSpec, digest
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.run_folder.manifests import find_contents, read_run_json, write_manifest, write_run_json
-from alpasim_plugin.run_folder.scenes import write_scene
 from alpasim_plugin.run_folder.schema import AGGREGATE, CONTENTS, slug
-from alpasim_plugin.run_folder.writer import write_parquet, writing
+from alpasim_plugin.run_folder.writer import write_parquet, write_scene, writing
 from alpasim_plugin.runtime.execute import Threads
-from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.plan import SCORING
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run, origin_of
-from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
+from alpasim_plugin.runtime.score_logs import KnownScenes, LogScore, exit_code, score_logs
 from alpasim_plugin.runtime.summary import pool_of
 from evaluators.alpasim import (
     EvalSettings,

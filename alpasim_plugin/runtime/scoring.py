@@ -61,7 +61,11 @@ def tabulate(
     """
     # Reports draw the distance from the recorded path also of runs whose preset does not score it.
     drawn = [] if any(one.name == "lateral_bias_m" for one in series) else [lateral_bias(rollout)]
-    rows = [row for one in (*series, *drawn) for row in _rows(one)]
+    rows = []
+    for one in (*series, *drawn):
+        for t, value, valid in zip(one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True):
+            number = None if np.isnan(value) else value  # an infinite one stays, as in AlpaSim's tables
+            rows.append({"t_us": t, "metric": one.name, "value": number, "valid": valid, "reason": "" if valid else one.reason})
     rows += _state_rows(rollout)
     rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in frames]
     rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in frames if name in f]
@@ -73,13 +77,6 @@ def contacts_of(rollout: RolloutLog, preset: str | Preset) -> tuple[ContactEvent
     """Return the contact onsets of the ego if the preset searches contact between steps; else none."""
     chosen = find_preset(preset)
     return contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
-
-
-def _rows(series: MetricSeries) -> list[dict[str, Any]]:
-    return [
-        {"t_us": int(t), "metric": series.name, "value": _number(v), "valid": bool(ok), "reason": "" if ok else series.reason}
-        for t, v, ok in zip(series.t_us, series.value, series.valid, strict=True)
-    ]
 
 
 def _row(t_us: int, metric: str, value: Any, why_missing: str = "") -> dict[str, Any]:
@@ -113,8 +110,3 @@ def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
         at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
         placed.append(dict(event) | {"x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)})
     return sorted(placed, key=lambda event: (event["t_us"], event["metric"]))
-
-
-def _number(value: float | None) -> float | None:
-    """Return a value for a table: missing where it is NaN; an infinite one stays, as in AlpaSim's tables."""
-    return None if value is None or np.isnan(value) else float(value)

@@ -109,7 +109,10 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
 def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
     """List the cells of a run that were asked for, the most telling first."""
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
-    for rollout in _ordered(run):
+    base = baseline_of(run)
+    rank = {name: i for i, name in enumerate(sorted(run.renderers, key=lambda name: name != base))}
+    scene = {name: i for i, name in enumerate(run.scenes)}
+    for rollout in sorted(run.rollouts, key=lambda r: (scene[r.scene], r.policy, r.seed, rank[r.renderer])):
         if not _asked(rollout, wanted):
             continue
         key, take = (rollout.scene, rollout.policy, rollout.seed), 0
@@ -143,14 +146,6 @@ def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted, at_most: int 
 def telling(cells: Iterable[WatchedCell], kinds: Sequence[Interest] = ("flip",)) -> list[WatchedCell]:
     """Return the watchable cells of some kinds."""
     return [cell for cell in cells if cell.interest in kinds and cell.watchable]
-
-
-def _ordered(run: Run) -> list[Rollout]:
-    """List rollouts by scene, then in the order of renderers, the baseline first."""
-    base = baseline_of(run)
-    rank = {name: i for i, name in enumerate(sorted(run.renderers, key=lambda name: name != base))}
-    scene = {name: i for i, name in enumerate(run.scenes)}
-    return sorted(run.rollouts, key=lambda r: (scene[r.scene], r.policy, r.seed, rank[r.renderer]))
 
 
 def _asked(rollout: Rollout, wanted: Wanted) -> bool:

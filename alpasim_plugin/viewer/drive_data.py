@@ -1,27 +1,137 @@
-"""One rollout for a page: where the ego and the others were, what was planned, every metric over time, and what happened when."""
+"""Numbers of a page in whole centimetres, milliseconds and milliradians: the map of a scene, and what moves and happens in a rollout."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, LoggedPlan, RolloutLog, Trajectory
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.run_folder.rows import Rollout, series_by_cell
-from alpasim_plugin.viewer.units import Place, mrad, rounded
+from alpasim_plugin.run_folder.schema import FRAMES_NAME
 from evaluators.opening import Run
+from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
 from evaluators.report.rollouts import SERIES, Event, events_of
+
+METRIC_DIGITS = 5
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where and when a scene's page counts from.
+
+    Attributes:
+        origin: ``(2,)`` metres, world: the first point of the recorded drive.
+        zero_us: The first camera frame (`evaluators.report.events.clock_zero_us`), on the scene's clock.
+    """
+
+    origin: F64
+    zero_us: int
+
+    def cm(self, xy: npt.ArrayLike) -> list[list[int]]:
+        """Return ``(N, 2)`` world metres as x and y in whole centimetres."""
+        scaled = np.rint((np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.origin) * 100.0).astype(int)
+        return [scaled[:, 0].tolist(), scaled[:, 1].tolist()]
+
+    def ms(self, t_us: I64 | Sequence[int]) -> list[int]:
+        """Return times ``(N,)`` in whole milliseconds."""
+        ms: list[int] = np.rint((np.asarray(t_us, dtype=np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
+        return ms
+
+    def track(self, trajectory: Trajectory) -> dict[str, list[int]]:
+        """Return a trajectory as t (ms), x, y (cm) and a (heading, mrad; continuous, so that it can be interpolated)."""
+        x, y = self.cm(trajectory.xyz[:, :2])
+        return {"t": self.ms(trajectory.t_us), "x": x, "y": y, "a": mrad(yaw_from_quat(trajectory.quat))}
+
+
+def mrad(yaw: npt.ArrayLike) -> list[int]:
+    """Return headings ``(N,)`` in radians as continuous whole milliradians."""
+    out: list[int] = np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
+    return out
+
+
+def rounded(values: F64) -> list[float | None]:
+    """Return values with `METRIC_DIGITS` digits; None where not finite.
+
+    Example:
+        >>> rounded(np.array([0.123456789, np.nan, 3.0]))
+        [0.12346, None, 3.0]
+    """
+    return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
+
+
+AROUND_M = 120.0  # what is farther from the recorded drive is not drawn
+TOLERANCE_M = 0.04  # of simplified lines
+
+
+def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
+    """Return the recorded drive of ``scenes/SCENE.json``, ``(N, 2)`` metres, world.
+
+    Raises:
+        InputError: It has fewer than two points.
+    """
+    log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]]).astype(np.float64)
+    if len(log) < 2:
+        raise InputError("drawing a scene", scene, f"a recorded drive of {len(log)} points", "make the run again")
+    return log
+
+
+def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
+    """Return what every view from above draws of a map, as the report's does: ``lanes``, ``paint``, ``edges`` and ``crosswalks``.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+
+    Returns:
+        Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
+    """
+    lanes = content.get("lanes") or []
+
+    def arrays(lines: Sequence[Any], least: int) -> list[F64]:
+        """Return the lines of at least so many points."""
+        return [np.asarray(line, dtype=np.float64)[:, :2] for line in lines if line is not None and len(line) >= least]
+
+    return {
+        "lanes": arrays([lane_ring(lane) for lane in lanes], 3),
+        "paint": arrays([edge for lane in lanes for edge in painted_edges(lane)], 2),
+        "edges": arrays(content.get("road_edges") or [], 2),
+        "crosswalks": arrays(content.get("crosswalks") or [], 3),
+    }
+
+
+def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:
+    """Return the map in whole centimetres.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+        log: As `recorded_drive` returns it.
+        place: Where numbers count from.
+    """
+    window = shapely.box(*(log.min(axis=0) - AROUND_M), *(log.max(axis=0) + AROUND_M))
+
+    def near(lines: Sequence[F64]) -> list[list[list[int]]]:
+        """Simplify the lines that come near."""
+        shapes = shapely.simplify([shapely.linestrings(line) for line in lines], TOLERANCE_M, preserve_topology=False)
+        kept = {shape.wkb: shape for shape in shapes if window.intersects(shape)}  # a border shared by two lanes is drawn once
+        return [place.cm(shapely.get_coordinates(shape)) for shape in kept.values()]
+
+    lines = {kind: near(some) for kind, some in drawn_map(content).items()}
+    return {"turn": round(chord_angle(log), 4), **lines, "log": place.cm(log), "source": str(content.get("source") or "")}
+
 
 PLAN_STEP_US = 500_000
 MAX_SAMPLES = 8  # of a plan; the first ones
 POSE_SERIES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
-FRAME_FACTS = "frames.jsonl"
 MAX_FRAME_EVENTS = 20
 CONTACT_TOLERANCE_S = 0.25  # between a contact and the step that counts it
 
@@ -107,13 +217,11 @@ def _user(name: str, label: str, size_m: tuple[float, float], way: dict[str, lis
 
 def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
     """Return a plan and its samples, every half second: points from now on."""
-    lines = [plan.trajectory, *plan.samples[:MAX_SAMPLES]]
-    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": [_points(line, place) for line in lines]}
-
-
-def _points(line: Trajectory, place: Place) -> list[list[int]]:
-    times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
-    return place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1))
+    lines = []
+    for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES]):
+        times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
+        lines.append(place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1)))
+    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": lines}
 
 
 def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
@@ -164,7 +272,7 @@ def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
 
 def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, Any]]:
     """Return when an event of the frames began, such as a fixer's frame that was replaced; one that goes on is told once."""
-    path = run.file_of(rollout, FRAME_FACTS)
+    path = run.file_of(rollout, FRAMES_NAME)
     found: list[dict[str, Any]] = []
     before: set[str] = set()
     for row in read_facts(path) if path is not None else []:

@@ -11,18 +11,15 @@ from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import LOG_NAME
 from alpasim_plugin.viewer.cells import WatchedCell
-from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
-from alpasim_plugin.viewer.map_data import map_data, recorded_drive
+from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
-from alpasim_plugin.viewer.units import Place
-from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
 from evaluators.report.flips import FLIPS_NAME, baseline_of
 from evaluators.report.rollouts import clock_zero_us
 
 DOING = "reading a rollout to watch"
-LOG = "rollout.asl"
 
 
 Logs = Mapping[str, RolloutLog | SimrunError | None]  # folder of a rollout -> its log, or why it cannot be read
@@ -34,7 +31,7 @@ def read_logs(run: Run, cell: WatchedCell) -> Logs:
 
 
 def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
-    path = run.file_of(rollout, LOG)
+    path = run.file_of(rollout, LOG_NAME)
     if path is None:
         stated = run.manifest(rollout).get("log")  # as it was named to simrun score, so from the same working directory
         path = None if stated is None else Path(str(stated))
@@ -117,13 +114,16 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
     """
     ids = {cell.id for cell in here}
     units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}
-    base = baseline_of(run)
+    metrics = {}
+    for name in run.table.ordered({*run.table, *units}):
+        metric, stated = run.table.shown(name), units.get(name) or {}
+        metrics[name] = {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
     return {
         "run": run.folder.resolve().name,
         "renderers": run.renderers,
-        "baseline": base,
+        "baseline": baseline_of(run),
         "first_curves": run.table.first_curves(),
-        "metrics": {name: _metric(run.table.shown(name), units.get(name) or {}) for name in run.table.ordered({*run.table, *units})},
+        "metrics": metrics,
         "cells": [
             {
                 "id": cell.id,
@@ -140,10 +140,6 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         ],
         **state,
     }
-
-
-def _metric(metric: MetricInfo, stated: Mapping[str, Any]) -> dict[str, Any]:
-    return {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
 
 
 def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:

@@ -16,9 +16,9 @@ from alpasim_plugin.core.types import U8, LoggedImage, RolloutLog
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.video_reader import VideoReader
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import VIDEO_NAME
 from evaluators.opening import Run
 
-VIDEO = "front.mp4"
 JPEG_QUALITY = 76
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
@@ -71,10 +71,10 @@ def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
     if log is not None and log.images:
         cameras = dict.fromkeys(image.camera for image in log.images)
         return [Source(name, tuple(image for image in log.images if image.camera == name)) for name in cameras]
-    video = run.file_of(rollout, VIDEO)
+    video = run.file_of(rollout, VIDEO_NAME)
     if video is None:
         return []
-    return [Source(VIDEO.removesuffix(".mp4"), video=(video, log.render_start_us if log is not None else 0))]
+    return [Source(VIDEO_NAME.removesuffix(".mp4"), video=(video, log.render_start_us if log is not None else 0))]
 
 
 def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
@@ -84,7 +84,12 @@ def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
         picture = smaller(rgb, fine.width_px)
         size = (picture.shape[1], picture.shape[0])
         t_ms.append(round((t_us - zero_us) / 1000))
-        data.append(base64.b64encode(_jpeg(picture)).decode())
+        # Halved colour resolution and optimised tables: a page is looked at, not measured.
+        settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+        done, jpeg = cv2.imencode(".jpg", picture[..., ::-1], settings)
+        if not done:
+            raise InputError("encoding a camera frame", f"array {picture.shape}", "the encoder refused", "use smaller images")
+        data.append(base64.b64encode(jpeg.tobytes()).decode())
     return {"name": source.camera, "width": size[0], "height": size[1], "t": t_ms, "jpeg": data}
 
 
@@ -95,11 +100,3 @@ def smaller(rgb: U8, width_px: int) -> U8:
         return rgb
     size = (width_px, max(1, round(height * width_px / width)))
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _jpeg(rgb: U8) -> bytes:
-    """Encode with halved colour resolution and optimised tables; a page is looked at, not measured."""
-    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
-    if not done:
-        raise InputError("encoding a camera frame", f"array {rgb.shape}", "the encoder refused", "use smaller images")
-    return bytes(data.tobytes())

@@ -16,9 +16,8 @@ from urllib.parse import unquote, urlsplit
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.run_folder.reader import RunSoFar
-from alpasim_plugin.viewer.budget import as_json
 from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted
-from alpasim_plugin.viewer.page import Options, render
+from alpasim_plugin.viewer.page import Options, as_json, render
 from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from evaluators.opening import Run
 
@@ -94,8 +93,8 @@ class RunServer(ThreadingHTTPServer):
         self._read, self._wanted, self._options = read, wanted, options
         self._lock = threading.Lock()
         self._seen: tuple[float, RunSoFar[Run]] | None = None  # until when it is young enough
-        check_wanted(self.seen().run, wanted)
-        self.root = self.seen().run.folder.resolve()
+        check_wanted(self.run, wanted)
+        self.root = self.run.folder.resolve()
         try:
             super().__init__(address, _Handler)
         except OSError as error:
@@ -123,9 +122,16 @@ class RunServer(ThreadingHTTPServer):
                 self._seen = (done + max(LEAST_AGE_S, (done - began) / MOST_SHARE), now)
             return self._seen[1]
 
+    @property
+    def run(self) -> Run:
+        """Give the run as it was a moment ago, with its table of metrics."""
+        run = self.seen().run
+        assert isinstance(run, Run), "read with `evaluators.opening.read_so_far`"
+        return run
+
     def cells(self) -> list[WatchedCell]:
         """List the cells of which anything is there."""
-        return cells_of(self.seen().run, self._wanted)
+        return cells_of(self.run, self._wanted)
 
     def index(self) -> dict[str, Any]:
         """Return what the page shows of the run."""
@@ -139,14 +145,14 @@ class RunServer(ThreadingHTTPServer):
             "notes": [f"Damaged: {text}" for text in seen.damage],
             "report": report,
         }
-        return index_data(seen.run, cells, [cell for cell in cells if cell.watchable], state)
+        return index_data(self.run, cells, [cell for cell in cells if cell.watchable], state)
 
     def cell(self, name: str) -> dict[str, Any] | None:
         """Return a cell's document; None where there is none of that id."""
         found = next((cell for cell in self.cells() if cell.id == name and cell.watchable), None)
         if found is None:
             return None
-        run = self.seen().run
+        run = self.run
         return cell_data(run, found, read_logs(run, found), self._options.fine, self._options.camera)
 
 

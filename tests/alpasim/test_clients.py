@@ -23,10 +23,10 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError, PolicyEr
 from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.runtime.compose import make_renderer
-from alpasim_plugin.runtime.known_scenes import scenario_finder
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runtime.score_logs import scenario_finder
 from alpasim_plugin.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
 from alpasim_plugin.wire.services import Stub, handlers
 from scenarios.library import shipped_names

@@ -20,10 +20,10 @@ from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.runtime.compose import make_renderer
-from alpasim_plugin.runtime.known_scenes import scenario_finder
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runtime.score_logs import scenario_finder
 from alpasim_plugin.wire import SERVICE_PATHS
 from alpasim_plugin.wire.services import OPTIONS, handlers, methods
 from evaluators import reduce_rollout, score

@@ -18,7 +18,7 @@ from alpasim_plugin.core.types import Observation, Plan
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.run_folder.schema import LOG_NAME
-from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from evaluators import score

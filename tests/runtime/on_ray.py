@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.runtime.executors.assignment import Assignment, assignment_as_here
+from alpasim_plugin.runtime.executors.assignment import Assignment, Contents, assignment_as_here
 from alpasim_plugin.runtime.executors.base import Resources
 from alpasim_plugin.runtime.executors.choice import Executor
-from alpasim_plugin.runtime.executors.node_files import Contents
 from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.plan import RunPlan
 from alpasim_plugin.runtime.run import RunResult, execute_run

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.types import Frame, RenderRequest, Route, Scenario, SensorSpec
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.run_folder.manifests import read_manifest
@@ -123,6 +124,35 @@ def test_what_cannot_be_repeated_is_said(tmp_path: Path) -> None:
     failed = certificate(of_one_scene("tests.runtime.broken_policies:Raises"), tmp_path / "failed")
     assert failed == {"status": "skipped", "reason": "no rollout finished"}
     assert certificate_line(failed) == "skipped: no rollout finished"
+
+
+class AwayAfterItsFirstDrive(ConstantVelocity):
+    """Fails as a service does that has gone after the first rollout."""
+
+    drives = 0
+
+    def reset(self, seed: int, route: Route) -> None:
+        super().reset(seed, route)
+        AwayAfterItsFirstDrive.drives += 1
+        if AwayAfterItsFirstDrive.drives > 1:
+            raise InfrastructureError("asking a driver", "localhost:1", "connection refused", "start the driver again")
+
+
+def test_a_peer_that_is_gone_when_a_rollout_is_repeated_costs_neither_tables_nor_reports(tmp_path: Path) -> None:
+    refs = expand("smoke/straight", (SHORT, *BARE))
+    policy = f"{__name__}:AwayAfterItsFirstDrive"
+    plan = make_plan(refs, ("clean",), (policy,), (0,), RunOptions(images="none"))
+    result = execute_run(plan, tmp_path, 1, ["simrun"], Announced())
+    found = result.summary["determinism"]
+    assert found["status"] == "skipped"
+    assert found["reason"] == "the repeat failed: asking a driver, localhost:1: connection refused"
+    assert found["error"]["do"] == "start the driver again"
+    assert result.exit_code == 0  # every rollout has run to its end
+    assert found["reason"] in certificate_line(found)
+    assert found["reason"] in (tmp_path / "report.html").read_text()
+    assert all((tmp_path / name).exists() for name in ("summary.json", "junit.xml", "summary.md", "contents.json"))
+    again = execute_run(plan, tmp_path, 1, ["simrun"], Announced(), report=False).summary["determinism"]
+    assert again["status"] == "skipped"  # tried again, since it was not made
 
 
 class Blind(ConstantVelocity):

@@ -18,11 +18,11 @@ from alpasim_plugin.plugins.parts import resolve
 from alpasim_plugin.run_folder.manifests import write_run_json
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.runtime.certificate import rollout_trace
-from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.fork import Change, fork_rollout, merge_sensors
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.probe import probe_rollout, write_probe
+from alpasim_plugin.runtime.reports import write_flips
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from scenarios.suite import expand
 from tests.examples import first_of

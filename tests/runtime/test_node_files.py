@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.io.atomic import temporary_path
-from alpasim_plugin.runtime.executors.node_files import measured_folder, scratch_root, sweep
+from alpasim_plugin.runtime.executors.assignment import measured_folder, scratch_root, sweep
 
 NO_PROCESS = 2**22 + 1  # above the most that Linux gives
 LATER_S = 4_102_444_800.0  # of a file system whose clock is far ahead of this machine's

@@ -16,10 +16,9 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.executors.assignment import identity_of
+from alpasim_plugin.runtime.executors.assignment import Contents, identity_of
 from alpasim_plugin.runtime.executors.base import Lost, Resources
 from alpasim_plugin.runtime.executors.choice import Executor
-from alpasim_plugin.runtime.executors.node_files import Contents
 from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import execute_run

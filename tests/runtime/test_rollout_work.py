@@ -6,10 +6,10 @@ import pickle
 from pathlib import Path
 
 from alpasim_plugin.io import measured
+from alpasim_plugin.runtime.commits import RolloutResult
+from alpasim_plugin.runtime.executors.assignment import measured_folder
 from alpasim_plugin.runtime.executors.base import Node
 from alpasim_plugin.runtime.executors.job import rollout_work
-from alpasim_plugin.runtime.executors.node_files import measured_folder
-from alpasim_plugin.runtime.executors.result import RolloutResult
 from alpasim_plugin.runtime.provenance import chosen
 from tests.runtime.test_decide import plan_of
 

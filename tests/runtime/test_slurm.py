@@ -16,10 +16,9 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.executors.assignment import assignment_as_here, identity_of
+from alpasim_plugin.runtime.executors.assignment import Contents, assignment_as_here, identity_of
 from alpasim_plugin.runtime.executors.base import Lost, Resources
 from alpasim_plugin.runtime.executors.choice import Executor
-from alpasim_plugin.runtime.executors.node_files import Contents
 from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.run import execute_run
 from tests.runtime.remote_work import Scripted

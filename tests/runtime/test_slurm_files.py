@@ -11,9 +11,8 @@ import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.runtime.executors import slurm_backend
-from alpasim_plugin.runtime.executors.assignment import assignment_as_here
+from alpasim_plugin.runtime.executors.assignment import Contents, assignment_as_here
 from alpasim_plugin.runtime.executors.base import Resources
-from alpasim_plugin.runtime.executors.node_files import Contents
 from alpasim_plugin.runtime.executors.slurm_backend import SlurmBackend, sessions_folder
 from tests.runtime.remote_work import Scripted
 

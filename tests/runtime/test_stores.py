@@ -18,11 +18,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.runtime.commits import Commits, Index, RolloutResult
 from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.runtime.executors.result import RolloutResult
+from alpasim_plugin.runtime.objects import FolderObjects, Objects, RemoteObjects, open_objects
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.runtime.stores.commits import Commits, Index
-from alpasim_plugin.runtime.stores.objects import FolderObjects, Objects, RemoteObjects, open_objects
 from tests.runtime.s3_server import Line, s3_line
 from tests.runtime.test_runs import Announced, cheap_plan, comparable
 
@@ -229,7 +228,7 @@ def test_a_store_that_stays_away_is_an_error_that_names_it(s3: Line) -> None:
 
 
 def test_a_node_fetches_a_content_once_and_refuses_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from alpasim_plugin.runtime.executors.node_files import place
+    from alpasim_plugin.runtime.executors.assignment import place
 
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
     fetched = []

@@ -11,9 +11,8 @@ from urllib.parse import quote
 import pytest
 
 from alpasim_plugin.viewer.cells import Wanted
-from alpasim_plugin.viewer.page import Options
+from alpasim_plugin.viewer.page import Options, write_page
 from alpasim_plugin.viewer.serve import RunServer
-from alpasim_plugin.viewer.write import write_page
 from evaluators.opening import read_run, read_so_far
 from evaluators.report import write_report
 from tests.report.browser import Browser

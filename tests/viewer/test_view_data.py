@@ -20,10 +20,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.run_folder.rows import series_by_cell
 from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, shown_by_default
-from alpasim_plugin.viewer.page import Options, make_page
+from alpasim_plugin.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
 from alpasim_plugin.viewer.page_data import cell_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
-from alpasim_plugin.viewer.write import FLIPS_PAGE, write_flips_page, write_page
 from evaluators.opening import read_run
 from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
 from tests.report.make_run import DT_US, Plan

@@ -22,7 +22,7 @@ class Node:
 
     Attributes:
         name: Name of its machine, for messages.
-        fetch: Gives the bytes of a content by its SHA-256 (`alpasim_plugin.runtime.executors.node_files`).
+        fetch: Gives the bytes of a content by its SHA-256 (`alpasim_plugin.runtime.executors.assignment`).
     """
 
     name: str

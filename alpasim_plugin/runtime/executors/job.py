@@ -18,8 +18,8 @@ from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction import KIND as MODELS
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import failed_manifest, run_cell
-from alpasim_plugin.runtime.executors.base import Faulty, Node
-from alpasim_plugin.runtime.executors.node_files import (
+from alpasim_plugin.runtime.commits import RolloutResult, commit_key, pack, run_stored_cell
+from alpasim_plugin.runtime.executors.assignment import (
     Contents,
     is_here,
     measured_folder,
@@ -29,9 +29,8 @@ from alpasim_plugin.runtime.executors.node_files import (
     scratch_root,
     with_paths,
 )
-from alpasim_plugin.runtime.executors.result import RolloutResult, pack
+from alpasim_plugin.runtime.executors.base import Faulty, Node
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runtime.stores.commits import commit_key, run_stored_cell
 from scenarios.suite import ScenarioRef
 
 HELD_SCENES = 4  # by each worker
@@ -49,7 +48,7 @@ class RolloutWork:
         backgrounds: Scene -> its background file (path on the driver -> SHA-256).
         models: Scene -> files of its reconstruction (name -> SHA-256), where the driver has it; otherwise each node fits its own.
         store: URL of a store in which rollouts are looked up and committed.
-        fresh: As for `alpasim_plugin.runtime.stores.commits.commit_key`.
+        fresh: As for `alpasim_plugin.runtime.commits.commit_key`.
     """
 
     run: str

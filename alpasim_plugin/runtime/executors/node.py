@@ -40,8 +40,7 @@ class Serving:
 
     def accept(self, work: bytes) -> tuple[int, list[str]]:
         """Compare this node with the driver; take the work if nothing differs. Return the process number and what differs."""
-        from alpasim_plugin.runtime.executors.assignment import differences, identity_of
-        from alpasim_plugin.runtime.executors.node_files import sweep
+        from alpasim_plugin.runtime.executors.assignment import differences, identity_of, sweep
 
         sweep()
         reasons = differences(self._expected, identity_of(self._targets))
@@ -87,8 +86,7 @@ def serve_job(
     """
     own_path_only()
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
-    from alpasim_plugin.runtime.executors.assignment import differences, identity_of
-    from alpasim_plugin.runtime.executors.node_files import sweep
+    from alpasim_plugin.runtime.executors.assignment import differences, identity_of, sweep
 
     sweep()
     node = Node(os.environ.get("SLURMD_NODENAME") or socket.gethostname(), lambda sha256: Path(folder, "placed", sha256).read_bytes())

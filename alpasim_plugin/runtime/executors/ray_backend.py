@@ -15,10 +15,9 @@ from typing import Any, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.runtime.executors.assignment import Assignment
+from alpasim_plugin.runtime.executors.assignment import Assignment, sweep
 from alpasim_plugin.runtime.executors.base import Backend, Died, Done, Event, Place, Rules
 from alpasim_plugin.runtime.executors.node import Serving
-from alpasim_plugin.runtime.executors.node_files import sweep
 
 J = TypeVar("J")
 

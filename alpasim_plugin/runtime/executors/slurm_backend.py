@@ -26,10 +26,9 @@ from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.processes import is_running, started_of
 from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.process.subprocesses import safe_path
-from alpasim_plugin.runtime.executors.assignment import Assignment
+from alpasim_plugin.runtime.executors.assignment import Assignment, private_folder, sweep
 from alpasim_plugin.runtime.executors.base import Backend, Died, Done, Event, Faulty, Place, Rules
 from alpasim_plugin.runtime.executors.node import JobAnswer, serve_job
-from alpasim_plugin.runtime.executors.node_files import private_folder, sweep
 
 J = TypeVar("J")
 

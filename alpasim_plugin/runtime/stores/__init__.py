@@ -1,1 +1,0 @@
-"""Stores of finished rollouts by URL: a folder, a shared file system, or an object store."""
