@@ -24,6 +24,17 @@ OPTIONS: tuple[tuple[str, int], ...] = (
 )
 
 
+#: What gRPC says, as UNKNOWN or INTERNAL, where a connection broke in the middle of a call.
+BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
+
+
+def is_lost_connection(error: Any) -> bool:
+    """Tell whether a call failed because its peer is away, or went away, and not by the peer's own answer."""
+    code, text = error.code(), error.details() or ""
+    broken = code in (grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL) and any(sign in text for sign in BROKEN_TRANSPORT)
+    return broken or code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
+
+
 @dataclass(frozen=True)
 class Method:
     """One call of a service."""

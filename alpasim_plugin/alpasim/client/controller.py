@@ -73,7 +73,7 @@ class VdcController(Controller):
             planned_trajectory_in_rig=wire_trajectory(plan_in_rig(plan, state), "the plan"),
             future_time_us=to_us,
         )
-        answer = self._service.call("run_controller_and_vehicle", request, self._timeout_s)
+        answer = self._service.call("run_controller_and_vehicle", request, self._timeout_s, state.t_us)
         after = self._state(answer, to_us, state)
         self._expected_us = to_us
         return after if self._physics is None else self._physics.placed(state, after)
@@ -142,7 +142,7 @@ class Physics:
         boxes = wire_trajectory(offset_trajectory(poses, self._T_rig_box), "the ego's box")
         ego = physics_pb2.PhysicsGroundIntersectionRequest.EgoData(aabb=self._aabb, ego_trajectory_aabb=boxes)
         request = physics_pb2.PhysicsGroundIntersectionRequest(scene_id=self._scene, now_us=before.t_us, future_us=after.t_us, ego_data=ego)
-        answer = self._service.call("ground_intersection", request)
+        answer = self._service.call("ground_intersection", request, at_us=after.t_us)
         there = {int(one.timestamp_us): one.pose for one in answer.ego_trajectory_aabb.poses}
         if after.t_us not in there:
             found = f"poses at {sorted(there)} us, none at {after.t_us} us"

@@ -55,7 +55,7 @@ class RemoteActors(Actors):
         here = trajectory_from_poses([t_us], (ego.T_world_rig @ self._T_rig_box)[None])
         update = traffic_pb2.ObjectTrajectoryUpdate(object_id=EGO, trajectory=wire_trajectory(here, "the ego's box"))
         request = traffic_pb2.TrafficRequest(session_uuid=self._session, time_query_us=t_us, object_trajectory_updates=[update])
-        answer = self.service.call("simulate", request)
+        answer = self.service.call("simulate", request, at_us=t_us)
         standing = {actor_id: pose for actor_id, pose in poses.items() if actor_id not in self._moving}
         return standing | self._moved(answer, t_us)
 

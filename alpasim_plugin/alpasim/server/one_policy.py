@@ -74,7 +74,7 @@ def _file_digest(factory: Callable[..., Any]) -> str | None:
     """Return the SHA-256 of the file that defines the policy, for `get_version`."""
     try:
         file = inspect.getsourcefile(factory)
-    except TypeError:
+    except (TypeError, OSError):  # no Python source: a built-in, or typed after -c
         return None
     if file is None or not os.path.isfile(file):
         return None
