@@ -26,8 +26,8 @@ from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.io.atomic import atomic_file, atomic_folder, write_json, write_text
 from alpasim_plugin.io.config import load_yaml
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.rename import Renaming, Stage, copy_log
-from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.log.asl import Renaming, Stage, copy_log
+from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.plugins.parts import resolve_renderer
 from alpasim_plugin.run_folder.manifests import read_contents, read_manifest
 from alpasim_plugin.run_folder.schema import LOG_NAME, slug

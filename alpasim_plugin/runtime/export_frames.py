@@ -21,7 +21,7 @@ from alpasim_plugin.wire import logging_pb2, sensorsim_pb2
 
 
 class AddedFrames:
-    """Adds a camera and its frames to a log; a stage of `alpasim_plugin.log.rename.copy_log`.
+    """Adds a camera and its frames to a log; a stage of `alpasim_plugin.log.asl.copy_log`.
 
     Args:
         rollout: The log as read.

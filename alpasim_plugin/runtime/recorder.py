@@ -31,7 +31,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
-from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.loop_state import PathEnd

@@ -70,7 +70,17 @@ def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_drive
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     address, out = f"127.0.0.1:{free_port()}", tmp_path / "out"
-    command = ["--renderer", "clean", "--policy", f"alpasim://{address}?cameras=front", "smoke/straight", "--out", str(out), *SHORT, "--json"]
+    command = [
+        "--renderer",
+        "clean",
+        "--policy",
+        f"alpasim://{address}?cameras=front",
+        "smoke/straight",
+        "--out",
+        str(out),
+        *SHORT,
+        "--json",
+    ]
     with driver(address, "dies"):
         assert run_command(command) != 0
     (failed,) = json.loads(capsys.readouterr().out)["summary"]["failures"]["cells"]

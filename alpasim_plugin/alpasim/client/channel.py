@@ -68,7 +68,7 @@ class Service:
     Args:
         name: Name of the service, as in `alpasim_plugin.wire.SERVICE_PATHS`.
         target: ``HOST:PORT``.
-        error: Class of the errors that a failing call raises; a lost connection is never the fault of a policy, and has `InfrastructureError`.
+        error: Class of the errors that a failing call raises; a lost connection is no policy's fault: `InfrastructureError`.
         retries: Whether a call that may pass is made again, as AlpaSim does with renders and not with drivers.
     """
 

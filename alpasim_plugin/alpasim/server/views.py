@@ -15,7 +15,7 @@ from alpasim_plugin.wire import common_pb2, sensorsim_pb2
 
 DOING = "reading a render request"
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it
-MAX_SIDE_PX = 8192
+MAX_SIDE_PX, MAX_PIXELS = 8192, 1 << 24
 MAX_TIME_US = 2**62
 
 
@@ -54,9 +54,10 @@ def read_view(request: sensorsim_pb2.RGBRenderRequest) -> View:
     """
     camera = request.camera_intrinsics.logical_id
     what = f"scene {request.scene_id!r}, camera {camera!r} at {request.frame_end_us} us"
-    if not (0 < request.resolution_w <= MAX_SIDE_PX and 0 < request.resolution_h <= MAX_SIDE_PX):
+    sides = request.resolution_w, request.resolution_h
+    if not (min(sides) > 0 and max(sides) <= MAX_SIDE_PX and sides[0] * sides[1] <= MAX_PIXELS):
         found = f"{request.resolution_w} x {request.resolution_h} pixels"
-        raise InputError(DOING, what, found, f"ask for 1 to {MAX_SIDE_PX} pixels a side")
+        raise InputError(DOING, what, found, f"ask for 1 to {MAX_SIDE_PX} pixels a side, and {MAX_PIXELS} in all")
     if not request.frame_start_us <= request.frame_end_us < MAX_TIME_US:
         found = f"a shutter from {request.frame_start_us} to {request.frame_end_us} us"
         raise InputError(DOING, what, found, "give microseconds that do not fall")
