@@ -20,6 +20,27 @@ from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
 SEED_BITS, DIGEST_BITS = 64, 58
+EGO = "EGO"
+QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
+MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
+# One PoseAtTime as an element of Trajectory.poses: protobuf tags and lengths (bytes) before each number.
+_TAGS = {
+    "head": ("x", b"\x0a\x32\x0a\x27\x0a\x0f\x0d"),  # PoseAtTime of 50 bytes, pose of 39, vec of 15, x
+    "tag_y": ("y", b"\x15"),
+    "tag_z": ("z", b"\x1d"),
+    "tag_qw": ("qw", b"\x12\x14\x0d"),  # quat of 20 bytes, w
+    "tag_qx": ("qx", b"\x15"),
+    "tag_qy": ("qy", b"\x1d"),
+    "tag_qz": ("qz", b"\x25"),
+    "tag_t": ("t_us", b"\x11"),
+}
+_POSE_AT_TIME = np.dtype(
+    [
+        field
+        for name, (number, tag) in _TAGS.items()
+        for field in ((name, "u1", (len(tag),)), (number, "<u8" if number == "t_us" else "<f4"))
+    ]
+)
 
 
 def session_uuid(seed: int, identity: str) -> str:
@@ -40,30 +61,6 @@ def session_uuid(seed: int, identity: str) -> str:
     # Layout: 48 bits, version 8, 12 bits, variant 0b10, 62 bits; the seed's 64 bits come first among the free ones.
     high, middle, low = seed >> 16, (seed >> 4) & 0xFFF, seed & 0xF
     return str(uuid.UUID(int=(high << 80) | (8 << 76) | (middle << 64) | (0b10 << 62) | (low << DIGEST_BITS) | digest))
-
-
-EGO = "EGO"
-QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
-MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
-
-# One PoseAtTime as an element of Trajectory.poses: protobuf tags and lengths (bytes) before each number.
-_TAGS = {
-    "head": ("x", b"\x0a\x32\x0a\x27\x0a\x0f\x0d"),  # PoseAtTime of 50 bytes, pose of 39, vec of 15, x
-    "tag_y": ("y", b"\x15"),
-    "tag_z": ("z", b"\x1d"),
-    "tag_qw": ("qw", b"\x12\x14\x0d"),  # quat of 20 bytes, w
-    "tag_qx": ("qx", b"\x15"),
-    "tag_qy": ("qy", b"\x1d"),
-    "tag_qz": ("qz", b"\x25"),
-    "tag_t": ("t_us", b"\x11"),
-}
-_POSE_AT_TIME = np.dtype(
-    [
-        field
-        for name, (number, tag) in _TAGS.items()
-        for field in ((name, "u1", (len(tag),)), (number, "<u8" if number == "t_us" else "<f4"))
-    ]
-)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,10 @@ from alpasim_plugin.io.reading import read_json_lines
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO
 
+# In the order in which the loop makes them at one instant: where the ego got to, where the others are, what the cameras saw, what the
+# policy answered. Scores come last of all: they are made from the finished log.
+COMPONENTS = ("ego", "actors", "frames", "plans", "scores")
+
 Fact = str | int | float | bool | None
 
 
@@ -44,10 +48,6 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     rows: list[dict[str, Fact]] = read_json_lines(path, "reading facts of a rollout", do_this="run the rollout again")
     return rows
 
-
-# In the order in which the loop makes them at one instant: where the ego got to, where the others are, what the cameras saw, what the
-# policy answered. Scores come last of all: they are made from the finished log.
-COMPONENTS = ("ego", "actors", "frames", "plans", "scores")
 
 Key = tuple[int, str]  # time in microseconds, and which part of the component: a camera, a metric, ...
 Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256

@@ -17,6 +17,13 @@ from alpasim_plugin.io.atomic import temporary_path
 from alpasim_plugin.io.limits import ARCHIVE_BYTES
 from alpasim_plugin.io.reading import check_regular
 
+UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
+GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
+BT601, BT709 = 5, 1  # matrices of ITU-T H.273
+WRITABLE = {UNSPECIFIED: BT601, BT709: BT709, 4: 4, BT601: BT601, 6: BT601, 7: 7, 9: 9}  # stated matrix -> the one to convert with
+WRITING = "writing a video"
+_MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000/1001)
+
 
 def load_av(doing: str) -> Any:
     """Return the module ``av``.
@@ -39,10 +46,6 @@ def exact_conversion(av: Any) -> Any:
     """Return the scaler's settings for colour conversion. Its faster ones darken pictures by a grey level; these are exact to a tenth."""
     flags = av.video.reformatter.Interpolation
     return flags.BILINEAR | flags.ACCURATE_RND | flags.FULL_CHR_H_INP | flags.FULL_CHR_H_INT
-
-
-UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
-GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
 
 
 class TimedFrame(NamedTuple):
@@ -185,11 +188,6 @@ class VideoReader:
         return InputError(self._doing, str(self.path), found, do)
 
 
-BT601, BT709 = 5, 1  # matrices of ITU-T H.273
-WRITABLE = {UNSPECIFIED: BT601, BT709: BT709, 4: 4, BT601: BT601, 6: BT601, 7: 7, 9: 9}  # stated matrix -> the one to convert with
-WRITING = "writing a video"
-
-
 class VideoWriter:
     """Take frames one by one; use it in a ``with`` statement.
 
@@ -284,9 +282,6 @@ class VideoWriter:
 
     def _failure(self, error: Exception) -> InfrastructureError:
         return InfrastructureError(WRITING, str(self.path), str(error), "check that the folder exists and has room")
-
-
-_MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000/1001)
 
 
 class Video(NamedTuple):

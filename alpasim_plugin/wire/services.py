@@ -33,6 +33,24 @@ OPTIONS: tuple[tuple[str, int], ...] = (
 
 #: What gRPC says, as UNKNOWN or INTERNAL, where a connection broke in the middle of a call.
 BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
+#: Packages as AlpaSim names them, by the last part of ours; "" is no package.
+PACKAGES = {
+    "common": "common",
+    "controller": "controller",
+    "egodriver": "egodriver",
+    "health": "grpc.health.v1",
+    "logging": "logging",
+    "physics": "physics",
+    "reflection": "grpc.reflection.v1",
+    "runtime": "",
+    "sensorsim": "nre.grpc.protos.sensorsim",
+    "traffic": "traffic",
+    "video_model": "omnidreams.video_model",
+}
+OURS = ".simrun.wire."
+V1ALPHA = "/grpc.reflection.v1alpha.ServerReflection/"
+NOT_FOUND = grpc.StatusCode.NOT_FOUND.value[0]
+UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
 
 
 def is_lost_connection(error: Any) -> bool:
@@ -122,26 +140,6 @@ def handlers(service: str, implementation: object, prefix: str | None = None) ->
                 serve, request_deserializer=method.request.FromString, response_serializer=method.response.SerializeToString
             )
     return grpc.method_handlers_generic_handler((prefix or SERVICE_PATHS[service]).strip("/"), made)
-
-
-#: Packages as AlpaSim names them, by the last part of ours; "" is no package.
-PACKAGES = {
-    "common": "common",
-    "controller": "controller",
-    "egodriver": "egodriver",
-    "health": "grpc.health.v1",
-    "logging": "logging",
-    "physics": "physics",
-    "reflection": "grpc.reflection.v1",
-    "runtime": "",
-    "sensorsim": "nre.grpc.protos.sensorsim",
-    "traffic": "traffic",
-    "video_model": "omnidreams.video_model",
-}
-OURS = ".simrun.wire."
-V1ALPHA = "/grpc.reflection.v1alpha.ServerReflection/"
-NOT_FOUND = grpc.StatusCode.NOT_FOUND.value[0]
-UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
 
 
 @lru_cache(maxsize=1)

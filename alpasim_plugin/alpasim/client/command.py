@@ -29,6 +29,13 @@ from alpasim_plugin.process.subprocesses import Child, exit_reason
 
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"
+DOING = "starting a policy's command"
+DRIVING = "driving by a policy's command"
+VARIABLE = "SIMRUN_POLICY_ADDRESS"
+READY_S = 120.0  # a container starts, a network is loaded
+POLL_S = 0.02
+REAP_S = 1.0  # between the end of a connection and that of the process behind it
+SHOWN_LINES = 3
 
 
 class Place(Protocol):
@@ -114,15 +121,6 @@ class LoopbackPort:
     def close(self) -> None:
         """Give the port's number back."""
         self._claim.close()
-
-
-DOING = "starting a policy's command"
-DRIVING = "driving by a policy's command"
-VARIABLE = "SIMRUN_POLICY_ADDRESS"
-READY_S = 120.0  # a container starts, a network is loaded
-POLL_S = 0.02
-REAP_S = 1.0  # between the end of a connection and that of the process behind it
-SHOWN_LINES = 3
 
 
 @dataclass(frozen=True)

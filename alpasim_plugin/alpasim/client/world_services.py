@@ -44,6 +44,7 @@ OPTIONS = ("physics", "scene", "timeout_s")
 DOING = "asking an AlpaSim controller"
 STEERED_MPS = 0.5  # below this speed a turn says nothing about the wheel
 _SESSIONS = itertools.count()
+ASKING_TRAFFIC = "asking an AlpaSim traffic service"
 
 
 class VdcController(Controller):
@@ -191,9 +192,6 @@ def _sent(pose: Any, what: str, service: Service) -> F64:
         return read_transform(pose, what)
     except InputError as error:
         raise InfrastructureError(DOING, service.target, f"{error.with_what}: {error.found}", "see the service's own log") from error
-
-
-ASKING_TRAFFIC = "asking an AlpaSim traffic service"
 
 
 class RemoteActors(Actors):

@@ -26,6 +26,9 @@ from alpasim_plugin.plugins.parts.spec import digest, file_digest
 from alpasim_plugin.wire import api_version, common_pb2
 from alpasim_plugin.wire.services import OPTIONS, Stub
 
+DOING = "setting up a renderer service"
+RECONNECT = (("grpc.min_reconnect_backoff_ms", 200), ("grpc.initial_reconnect_backoff_ms", 200), ("grpc.max_reconnect_backoff_ms", 2000))
+
 
 def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb2.VersionId | None = None) -> common_pb2.VersionId:
     """Return the triple of a service.
@@ -55,10 +58,6 @@ def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb
     version.git_hash = f"{everything[:40]}+{upstream.git_hash}"
     version.grpc_api_version.CopyFrom(upstream.grpc_api_version)
     return version
-
-
-DOING = "setting up a renderer service"
-RECONNECT = (("grpc.min_reconnect_backoff_ms", 200), ("grpc.initial_reconnect_backoff_ms", 200), ("grpc.max_reconnect_backoff_ms", 2000))
 
 
 @dataclass(frozen=True)

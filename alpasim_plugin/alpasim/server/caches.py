@@ -25,6 +25,8 @@ from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
 
 CHOOSING = "choosing a renderer to serve"
+DOING = "looking for a scene"
+FILES = (".usdz", ".yaml", ".yml", ".xml")
 
 
 class CausalFixer(Protocol):
@@ -97,10 +99,6 @@ def size_of(value: Any) -> int:
     if hasattr(value, "__dataclass_fields__"):
         return sum(size_of(getattr(value, name)) for name in value.__dataclass_fields__)
     return 0
-
-
-DOING = "looking for a scene"
-FILES = (".usdz", ".yaml", ".yml", ".xml")
 
 
 @dataclass(frozen=True)

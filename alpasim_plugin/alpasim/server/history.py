@@ -36,6 +36,8 @@ SLACK_M = 0.1  # error of a predicted pose that is always allowed ...
 ACCEL_MPS2 = 10.0  # ... plus this times dt^2: twice the error of a constant speed under hard braking
 SPEED_MPS = 70.0  # where there is no motion to continue, farther than this times dt is another place
 LEVER_M = 2.0  # a turn by one radian counts as this distance
+S = TypeVar("S")
+GAP_US = 2_000_000  # longest time between two frames of a drive
 
 
 def distance(view: View, before: View, T_before: tuple[F64, int] | None) -> tuple[float, float]:
@@ -89,10 +91,6 @@ def _objects_apart(view: View, before: View, back: float) -> float:
     then = np.array([before.objects[track][1, :3, 3] for track in shared])
     start, end = (np.array([view.objects[track][i, :3, 3] for track in shared]) for i in (0, 1))
     return float(np.linalg.norm(end + back * (start - end) - then, axis=1).mean())
-
-
-S = TypeVar("S")
-GAP_US = 2_000_000  # longest time between two frames of a drive
 
 
 @dataclass(eq=False)

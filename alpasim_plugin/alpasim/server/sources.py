@@ -38,6 +38,8 @@ from alpasim_plugin.wire import sensorsim_pb2
 NEAR_M, FAR_M = 0.25, 3.0  # distance from the recorded path where trust begins to fall, and where it has fallen
 FAR = 0.6  # above 0.5: a hole is never invented
 ESTIMATING = "estimating the reliability of an upstream's frame"
+DOING = "rendering a requested frame"
+MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
 
 
 def path_reliability(path_xy: F64, xy: F64) -> float:
@@ -72,8 +74,6 @@ def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F
     return out
 
 
-DOING = "rendering a requested frame"
-MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
 Request = sensorsim_pb2.RGBRenderRequest
 
 
