@@ -140,6 +140,10 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         self._messages.expire()
         self._light_messages.expire()
 
+    def close(self) -> None:
+        """Let the threads go; calls have ended by now."""
+        self._light_pool.shutdown(wait=False)
+
     def _lets_in(self, metadata: Any) -> bool:
         if self._wanted is None:
             return True

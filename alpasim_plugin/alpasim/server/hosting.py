@@ -234,6 +234,7 @@ class Host:
         """Refuse new calls (UNAVAILABLE), let running ones finish within ``drain_s``, and close the port."""
         self.health.stop()
         self._server.stop(drain_s).wait()
+        self._gate.close()
         self._ended.set()
         if self._upkeep.is_alive():
             self._upkeep.join()

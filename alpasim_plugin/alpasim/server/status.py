@@ -72,8 +72,8 @@ class CallTime:
         return left
 
     @contextmanager
-    def holding(self, lock: threading.Lock) -> Iterator[None]:
-        """Hold a lock; waiting ends with the call's time."""
+    def holding(self, lock: threading.Lock | threading.Semaphore) -> Iterator[None]:
+        """Hold a lock, or a place of a semaphore; waiting ends with the call's time."""
         while True:
             left = self.left_s()
             if lock.acquire(timeout=POLL_S if left is None else min(left, POLL_S)):
