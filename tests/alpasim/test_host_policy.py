@@ -18,12 +18,14 @@ from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.alpasim.server.one_policy import _unknown_scene
+from alpasim_plugin.alpasim.server.views import read_lens, read_view
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.wire.services import Stub, methods
-from tests.alpasim.service_cases import StandInRenderer, channel_to, hosted, pinhole
+from tests.alpasim.service_cases import START_US, StandInRenderer, channel_to, hosted, pinhole, request
 
 EMPTY = common_pb2.Empty()
 Code = grpc.StatusCode
@@ -203,6 +205,15 @@ def test_a_message_that_is_none_is_the_callers_fault() -> None:
     with served("EgodriverService") as host, channel_to(host) as channel:
         for path in (methods("EgodriverService")["drive"].path, methods("Health")["Check"].path):
             assert failure(lambda path=path: channel.unary_unary(path)(b"\xff\xff\xff"))[0] is Code.INVALID_ARGUMENT
+
+
+def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory() -> None:
+    identity = np.eye(4)
+    with pytest.raises(InputError, match="in all"):
+        read_view(request(identity, identity, START_US, size=(8192, 4096)))
+    with pytest.raises(InputError, match="in all"):
+        read_lens(pinhole(8192, 4096), 8192, 4096)
+    assert read_view(request(identity, identity, START_US, size=(3848, 2168))).width == 3848
 
 
 # --- sessions of a driver -------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ import numpy as np
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.hosting import SESSIONS, Sessions
 from alpasim_plugin.alpasim.server.status import answering
+from alpasim_plugin.alpasim.server.views import MAX_TIME_US
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
@@ -34,7 +35,6 @@ SPEED_WINDOW_US = 200_000
 MOST_POSES = 8192  # of a session's motion; the oldest are forgotten
 MOST_CAMERAS = 64  # of a session
 KEPT_TIMES = 10_000  # newest drive calls whose time is kept
-MAX_TIME_US = 2**62
 
 
 class DriverService:

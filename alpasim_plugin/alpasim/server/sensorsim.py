@@ -45,8 +45,7 @@ class Sensorsim(Failures):
         """Render one frame."""
         left = CallTime(context)
         if self._verbatim:
-            handed_on: sensorsim_pb2.RGBRenderReturn = self._upstream.render_rgb(request, timeout=left.left_s())
-            return handed_on
+            return self._pass("render_rgb", request, context, sensorsim_pb2.RGBRenderReturn)
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self.frames.answers([request], left)[0])
 
     @answering
@@ -57,8 +56,7 @@ class Sensorsim(Failures):
         if len(set(names)) < len(names):
             raise InputError(DOING, f"a batch of {names}", "a camera name twice", "send one item a camera")
         if self._verbatim:
-            handed_on: sensorsim_pb2.BatchRGBRenderReturn = self._upstream.batch_render_rgb(request, timeout=left.left_s())
-            return handed_on
+            return self._pass("batch_render_rgb", request, context, sensorsim_pb2.BatchRGBRenderReturn)
         images = self.frames.answers([item.request for item in request.items], left)
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
         made = [item(camera_name=n, result=result(image_bytes=i), success=True) for n, i in zip(names, images, strict=True)]
@@ -69,13 +67,12 @@ class Sensorsim(Failures):
         """Render frames and lidar spins together; lidar and the renderer's data for the driver are the upstream's."""
         left = CallTime(context)
         if self._verbatim:
-            handed_on: sensorsim_pb2.AggregatedRenderReturn = self._upstream.render_aggregated(request, timeout=left.left_s())
-            return handed_on
+            return self._pass("render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn)
         if self._upstream is None:
             if request.lidar_requests:
                 raise NotHere("lidar")
             return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=self._returns(request, left))
-        reply: sensorsim_pb2.AggregatedRenderReturn = self._upstream.render_aggregated(request, timeout=left.left_s())
+        reply = self._pass("render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn)
         if request.rgb_requests:
             del reply.rgb_returns[:]
             reply.rgb_returns.extend(self._returns(request, left))

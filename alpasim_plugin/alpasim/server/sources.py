@@ -21,9 +21,8 @@ import grpc
 import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
-from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import View
+from alpasim_plugin.alpasim.server.views import Lens, View, read_lens
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest

@@ -23,9 +23,8 @@ import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, SceneEntry
 from alpasim_plugin.alpasim.server.hosting import Sessions
-from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
 from alpasim_plugin.alpasim.server.status import CallTime, Failures, UnknownScene, answering
-from alpasim_plugin.alpasim.server.views import read_pose
+from alpasim_plugin.alpasim.server.views import Lens, read_lens, read_pose
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
