@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
 from alpasim_plugin.alpasim.server.driver_service import DriverService
-from alpasim_plugin.alpasim.server.hosting import Host, Security
+from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.alpasim.server.one_policy import ADDRESS
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.types import Scenario
@@ -34,9 +33,7 @@ def serve_policy(
         str, Flag("Address, or unix:PATH; port 0 takes a free one.", metavar="HOST:PORT", variable=ADDRESS)
     ] = "127.0.0.1:50052",
     scenes: Annotated[tuple[str, ...], Flag("Scenes by whose id a policy gets map and vehicle; without it, it gets neither.")] = (),
-    tls_cert: Annotated[Path | None, Flag("PEM certificate of this server.")] = None,
-    tls_key: Annotated[Path | None, Flag("PEM key of this server.")] = None,
-    drain_s: Annotated[float, Flag("At the end, wait so long for running calls.", min=0.0)] = 10.0,
+    host_policy: HostPolicy = HostPolicy(),
     as_json: Annotated[bool, Flag("Print one JSON line when the port is open, and one at the end.", "--json")] = False,
 ) -> None:
     """Serve a policy as AlpaSim's EgodriverService, so that AlpaSim's runtime drives it.
@@ -44,15 +41,15 @@ def serve_policy(
     Each session gets a policy of its own, made for the session's cameras, which must be pinholes.
     """
     spec = resolve("policy", policy)
-    service = DriverService(spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes))
-    host = Host({"EgodriverService": service}, listen, Security(tls_cert, tls_key))
+    service = DriverService(spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes), host_policy.expiry_s)
+    host = Host({"EgodriverService": service}, listen, host_policy, every=service.sessions.expire)
     what = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     try:
         host.start()
         print(json.dumps(what) if as_json else f"serving EgodriverService at {host.address}: {policy}", flush=True)
         host.wait()
     except Stopped:
-        host.stop(drain_s)
+        host.stop(host_policy.drain_s)
     ms = np.array(service.drives_s) * 1000
     quantiles = {f"drive_ms_p{q}": round(float(np.percentile(ms, q)), 2) for q in (50, 95, 99)} if len(ms) else {}
     counts = dict(service.counts) | quantiles

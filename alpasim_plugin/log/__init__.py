@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from alpasim_plugin.log.facts import read_facts as read_facts
-    from alpasim_plugin.log.facts import write_facts as write_facts
     from alpasim_plugin.log.images import decode_image as decode_image
     from alpasim_plugin.log.images import encode_image as encode_image
     from alpasim_plugin.log.reader import read_asl as read_asl
     from alpasim_plugin.log.schema import RolloutHeader as RolloutHeader
     from alpasim_plugin.log.schema import header_from_scenario as header_from_scenario
+    from alpasim_plugin.log.trace import read_facts as read_facts
+    from alpasim_plugin.log.trace import write_facts as write_facts
     from alpasim_plugin.log.video import read_mp4 as read_mp4
     from alpasim_plugin.log.video import write_mp4 as write_mp4
     from alpasim_plugin.log.writer import AslWriter as AslWriter
@@ -40,9 +40,9 @@ __getattr__ = lazy_names(
         "encode_image": ".images",
         "header_from_scenario": ".schema",
         "read_asl": ".reader",
-        "read_facts": ".facts",
+        "read_facts": ".trace",
         "read_mp4": ".video",
-        "write_facts": ".facts",
+        "write_facts": ".trace",
         "write_mp4": ".video",
     },
 )

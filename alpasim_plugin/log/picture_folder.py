@@ -15,14 +15,14 @@ import numpy as np
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.io.atomic import atomic_folder, write_bytes
-from alpasim_plugin.log.video_reader import UNSPECIFIED, TimedFrame, VideoFormat
+from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat
 
 PERIOD = Fraction(1, 10)  # seconds from picture to picture: they have no times of their own
 WRITING = "writing a folder of pictures"
 
 
 class PictureFolderReader:
-    """Iterate over the ``.png`` files of a folder in order of name; like `log.video_reader.VideoReader`.
+    """Iterate over the ``.png`` files of a folder in order of name; like `log.video.VideoReader`.
 
     Args:
         path: The folder.
@@ -71,7 +71,7 @@ class PictureFolderReader:
 
 
 class PictureFolderWriter:
-    """Take frames one by one; the folder appears once the ``with`` block ends well. Like `log.video_writer.VideoWriter`.
+    """Take frames one by one; the folder appears once the ``with`` block ends well. Like `log.video.VideoWriter`.
 
     Args:
         path: The folder; replaced if it exists.

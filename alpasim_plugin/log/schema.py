@@ -6,6 +6,8 @@ integer microseconds in 64 bits and exact.
 
 from __future__ import annotations
 
+import hashlib
+import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -17,10 +19,10 @@ from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, EgoState, Ren
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
+SEED_BITS, DIGEST_BITS = 64, 58
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
 MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
-
 # One PoseAtTime as an element of Trajectory.poses: protobuf tags and lengths (bytes) before each number.
 _TAGS = {
     "head": ("x", b"\x0a\x32\x0a\x27\x0a\x0f\x0d"),  # PoseAtTime of 50 bytes, pose of 39, vec of 15, x
@@ -39,6 +41,26 @@ _POSE_AT_TIME = np.dtype(
         for field in ((name, "u1", (len(tag),)), (number, "<u8" if number == "t_us" else "<f4"))
     ]
 )
+
+
+def session_uuid(seed: int, identity: str) -> str:
+    """Return the session id of a rollout, a UUID of version 8 (RFC 9562, section 5.8).
+
+    AlpaSim pairs the rollouts of different scenes by the rank of their ids, so an id begins with the seed: rollouts of one seed have the
+    same rank in every scene. The rest is a digest, so that ids differ between renderers, policies and scenes.
+
+    Args:
+        seed: The rollout's seed, 0 to 2^64 - 1.
+        identity: Whatever determines the rollout; equal rollouts have equal ids.
+
+    Example:
+        >>> session_uuid(2, "a"), session_uuid(10, "a")
+        ('00000000-0000-8000-8b2a-5e044b286ef7', '00000000-0000-8000-ab2a-5e044b286ef7')
+    """
+    digest = int.from_bytes(hashlib.sha256(identity.encode()).digest()) >> (256 - DIGEST_BITS)
+    # Layout: 48 bits, version 8, 12 bits, variant 0b10, 62 bits; the seed's 64 bits come first among the free ones.
+    high, middle, low = seed >> 16, (seed >> 4) & 0xFFF, seed & 0xF
+    return str(uuid.UUID(int=(high << 80) | (8 << 76) | (middle << 64) | (0b10 << 62) | (low << DIGEST_BITS) | digest))
 
 
 @dataclass(frozen=True)

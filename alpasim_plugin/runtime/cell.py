@@ -32,7 +32,7 @@ from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
 if TYPE_CHECKING:
-    from alpasim_plugin.alpasim.client.traffic import RemoteActors
+    from alpasim_plugin.alpasim.client.world_services import RemoteActors
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class RolloutParts:
 
 def remote_actors(scenario: Scenario, address: str, seed: int) -> RemoteActors:
     """Connect a rollout's road users to a traffic service."""
-    from alpasim_plugin.alpasim.client.traffic import RemoteActors  # gRPC is loaded where a service is called
+    from alpasim_plugin.alpasim.client.world_services import RemoteActors  # gRPC is loaded where a service is called
 
     return RemoteActors(scenario, address, seed)
 

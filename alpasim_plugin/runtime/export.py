@@ -28,10 +28,9 @@ from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, RolloutLog
 from alpasim_plugin.io.atomic import atomic_file, atomic_folder, write_json, write_text
 from alpasim_plugin.io.config import load_yaml
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.asl import Renaming, Stage, copy_log
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.rename import Renaming, Stage, copy_log
-from alpasim_plugin.log.schema import wire_camera, wire_image, wire_render_request
-from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.log.schema import session_uuid, wire_camera, wire_image, wire_render_request
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.plugins.parts import resolve_renderer
 from alpasim_plugin.run_folder.manifests import read_contents, read_manifest
@@ -324,7 +323,7 @@ def _check_free(out: Path) -> None:
 
 
 class AddedFrames:
-    """Adds a camera and its frames to a log; a stage of `alpasim_plugin.log.rename.copy_log`.
+    """Adds a camera and its frames to a log; a stage of `alpasim_plugin.log.asl.copy_log`.
 
     Args:
         rollout: The log as read.

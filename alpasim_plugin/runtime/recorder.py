@@ -33,7 +33,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
-from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.runtime.loop_state import PathEnd

@@ -19,8 +19,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.picture_folder import PictureFolderReader, PictureFolderWriter
-from alpasim_plugin.log.video_reader import TimedFrame, VideoFormat, VideoReader
-from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.log.video import TimedFrame, VideoFormat, VideoReader, VideoWriter
 from alpasim_plugin.plugins.interfaces import Fixer
 
 Reader = VideoReader | PictureFolderReader

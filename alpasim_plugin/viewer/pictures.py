@@ -14,7 +14,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8, LoggedImage, RolloutLog
 from alpasim_plugin.log import decode_image
-from alpasim_plugin.log.video_reader import VideoReader
+from alpasim_plugin.log.video import VideoReader
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import VIDEO_NAME
 from evaluators.opening import Run

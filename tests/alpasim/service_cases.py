@@ -21,7 +21,7 @@ from alpasim_plugin.alpasim.client.served_drives import picture as picture
 from alpasim_plugin.alpasim.client.served_drives import pinhole as pinhole
 from alpasim_plugin.alpasim.client.served_drives import request as request
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, Upstream, assemble
-from alpasim_plugin.alpasim.server.hosting import Host, Security
+from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.wire import sensorsim_pb2
 from alpasim_plugin.wire.services import OPTIONS, Stub
 
@@ -45,10 +45,10 @@ def channel_to(host: Host) -> Iterator[Any]:
 
 
 @contextmanager
-def in_front_of(upstream: Host, security: Security = Security(), **settings: Any) -> Iterator[tuple[Any, Assembled]]:
+def in_front_of(upstream: Host, policy: HostPolicy = HostPolicy(), **settings: Any) -> Iterator[tuple[Any, Assembled]]:
     """Run the service in front of another; give a stub of it and its parts."""
     made = assemble(Settings(upstream=Upstream(upstream.address), threads=1, **settings))
-    with hosted({"SensorsimService": made.service}, security=security) as host, channel_to(host) as channel:
+    with hosted({"SensorsimService": made.service}, policy=policy) as host, channel_to(host) as channel:
         yield Stub(channel, "SensorsimService"), made
     made.close()
 

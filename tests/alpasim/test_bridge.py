@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from alpasim_plugin.alpasim.bridge import build as building
-from alpasim_plugin.alpasim.bridge import check
+from alpasim_plugin.alpasim.bridge import client as check
 from alpasim_plugin.alpasim.bridge.client import RendererClient
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.wire import sensorsim_pb2
@@ -29,7 +29,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool
 foreign = descriptor_pb2.FileDescriptorProto(name="alpasim_grpc/v0/common.proto", package="common")
 foreign.message_type.add(name="Vec3")
 descriptor_pool.Default().AddSerializedFile(foreign.SerializeToString())
-from alpasim_onefixer_bridge.client.check import main
+from alpasim_onefixer_bridge.client import main
 (entry,) = metadata.entry_points(group="alpasim.configs")
 assert entry.name == "onefixer" and entry.load().__name__ == entry.value
 from hydra import compose, initialize_config_module
@@ -51,7 +51,7 @@ def staged(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged: Path) -> None:
     allowed = {"grpc", "google", "__future__", *sys.stdlib_module_names}
     modules = [path for path in staged.rglob("*.py") if not path.name.endswith("_pb2.py")]
-    assert len(modules) >= 8
+    assert len(modules) >= 5
     for path in modules:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.client.controller import VdcController, plan_in_rig
-from alpasim_plugin.alpasim.client.traffic import RemoteActors
+from alpasim_plugin.alpasim.client.world_services import RemoteActors, VdcController, plan_in_rig
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.control.tracker import PlanTracker
 from alpasim_plugin.core.errors import InfrastructureError, InputError

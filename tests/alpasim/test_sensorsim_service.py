@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.alpasim.server.reliability import opacity
+from alpasim_plugin.alpasim.server.sources import trusted_opacity
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.types import Frame
@@ -105,7 +105,7 @@ def test_answers_equal_the_fixer_in_this_process(upstream: Host, overrides: list
     fixer = make_fixer("onefixer", fixer_settings("onefixer", [*overrides, "noise=content"]), scene_id="scene", threads=1)
     trusted = np.full((HEIGHT, WIDTH), 255, np.uint8)
     trusted[:, : WIDTH // 3] = 0
-    alpha = opacity(0.9, trusted, HEIGHT, WIDTH)
+    alpha = trusted_opacity(0.9, trusted, HEIGHT, WIDTH)
     for i, (asked, got) in enumerate(zip(frames, served, strict=True)):
         (fixed,) = fixer.step([Frame(START_US + i * STEP_US, CAMERA, picture(asked), alpha)], ())
         np.testing.assert_array_equal(got, fixed.rgb)

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.history import HistoryTree
-from alpasim_plugin.alpasim.server.motion import apart, on_line
+from alpasim_plugin.alpasim.server.history import HistoryTree, apart, on_line
 from alpasim_plugin.alpasim.server.views import View, read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2

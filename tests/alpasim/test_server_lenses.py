@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
+from alpasim_plugin.alpasim.server.views import Lens, read_lens
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.wire import sensorsim_pb2

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
-from alpasim_plugin.alpasim.server.hosting import Host, Security
+from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log.images import encode_image
@@ -196,12 +196,14 @@ def test_running_calls_finish_while_the_server_stops(upstream: Host, renderer: S
     made.close()
 
 
-def test_only_callers_with_the_token_are_served_but_health_is_open(upstream: Host) -> None:
-    with in_front_of(upstream, Security(token="secret"), renderer="identity") as (stub, made):
+def test_only_callers_with_the_token_are_served_but_health_is_open(upstream: Host, tmp_path: Path) -> None:
+    (tmp_path / "token").write_text(" secret \n")
+    policy = HostPolicy(token_file=tmp_path / "token")
+    with in_front_of(upstream, policy, renderer="identity") as (stub, made):
         assert failure(lambda: stub.get_version(EMPTY))[0] == Code.UNAUTHENTICATED
         assert failure(lambda: stub.get_version(EMPTY, metadata=[("authorization", "Bearer wrong")]))[0] == Code.UNAUTHENTICATED
         assert "identity" in stub.get_version(EMPTY, metadata=[("authorization", "Bearer secret")]).version_id
-        with hosted({"SensorsimService": made.service}, security=Security(token="secret")) as host, channel_to(host) as channel:
+        with hosted({"SensorsimService": made.service}, policy=policy) as host, channel_to(host) as channel:
             assert Stub(channel, "Health").Check(health_pb2.HealthCheckRequest()).status == 1
 
 
@@ -210,9 +212,10 @@ def test_tls_with_an_upstream_behind_tls_and_a_token(renderer: StandInRenderer, 
     made = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
     extra = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1", "-keyout", str(key), "-out", str(cert)]
     subprocess.run([*made, *extra], check=True, capture_output=True)
-    with hosted({"SensorsimService": renderer}, security=Security(cert, key, token="secret")) as behind:
+    (tmp_path / "token").write_text("secret")
+    with hosted({"SensorsimService": renderer}, policy=HostPolicy(cert, key, token_file=tmp_path / "token")) as behind:
         service = assemble(Settings(renderer="identity", upstream=Upstream(behind.address, cert, "secret")))
-        with hosted({"SensorsimService": service.service}, security=Security(cert, key, client_ca=cert)) as host:
+        with hosted({"SensorsimService": service.service}, policy=HostPolicy(cert, key, tls_client_ca=cert)) as host:
             trusted = cert.read_bytes()
             own = grpc.ssl_channel_credentials(trusted, key.read_bytes(), trusted)
             with grpc.secure_channel(host.address, own) as channel:
@@ -221,7 +224,7 @@ def test_tls_with_an_upstream_behind_tls_and_a_token(renderer: StandInRenderer, 
                 assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
         service.close()
     with pytest.raises(InputError, match="one of certificate and key"):
-        Security(cert).credentials()
+        HostPolicy(cert).credentials()
     with pytest.raises(InputError, match="a token over plain text"):
         Upstream("127.0.0.1:1", token="secret").channel()
 
@@ -241,6 +244,8 @@ def test_a_taken_port_is_an_infrastructure_error(upstream: Host) -> None:
         (["--upstream", "h:1", "--renderer", "onefixer-dit-tiny"], "blocks of frames"),
         (["--scenes", "smoke/straight", "--reliability", "0.5"], "states its opacity"),
         (["--upstream", "h:1", "--mask", "front"], "no NAME=VALUE"),
+        (["--upstream", "h:1?colour=red"], "an option that is unknown"),
+        (["--upstream", "h:1?token_file=/none"], "No such file"),
         (["--upstream", "h:1", "--tls-cert", "/none.pem"], "one of certificate and key"),
     ],
 )

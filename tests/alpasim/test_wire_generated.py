@@ -22,7 +22,7 @@ import sys, google.protobuf
 sys.path.insert(0, sys.argv[1])
 from google.protobuf import descriptor_pb2, descriptor_pool
 from bridge import wire
-from bridge.wire.reflection import public_pool
+from bridge.wire.services import public_pool
 from bridge.wire.services import methods
 assert "alpasim_plugin" not in sys.modules
 foreign = descriptor_pb2.FileDescriptorProto(name="alpasim_grpc/v0/common.proto", package="common")

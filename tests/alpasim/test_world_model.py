@@ -99,7 +99,7 @@ def test_chunks_equal_chunks_of_other_lengths_in_another_session(
     assert len(set(frames)) == sum(lengths)
     assert decode_image(frames[0]).shape == (H, W, 3)
     assert made.world_model is not None
-    assert len(made.world_model) == 0
+    assert len(made.world_model.sessions) == 0
 
 
 @pytest.mark.slow

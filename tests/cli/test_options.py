@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import pytest
 import typer
 
-from alpasim_plugin.cli import decide, gate, run, serve, view
+from alpasim_plugin.cli import decide, gate, run, serve, serve_policy, view
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, Only, command_of
 from alpasim_plugin.core.flags import Flag, Positional
@@ -85,19 +85,19 @@ def test_a_page_of_drives_gets_its_limits(called: Any, monkeypatch: pytest.Monke
 
 def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path) -> None:
     (tmp_path / "token").write_text(" secret \n")
-    bounds = ("--history-mb", "16", "--expiry-s", "60", "--upstream-image", "as-asked", "--prefetch")
-    upstream = ("--upstream", "host:1", "--upstream-ca", "ca.pem", "--upstream-token-file", str(tmp_path / "token"))
+    bounds = ("--history-mb", "16", "--expiry-s", "60", "--prefetch")
+    upstream = ("--upstream", f"host:1?ca=ca.pem&token_file={tmp_path / 'token'}&image=as-asked")
     settings = called(serve, "assemble", "serve", *bounds, *upstream)["settings"]
-    assert (settings.history_bytes, settings.expiry_s, settings.upstream_png) == (16 << 20, 60.0, False)
+    assert (settings.history_bytes, settings.expiry_s, settings.upstream.as_png) == (16 << 20, 60.0, False)
     assert (settings.upstream.token, settings.upstream.ca) == ("secret", Path("ca.pem"))
 
 
-def test_callers_of_a_server_are_let_in_as_asked(called: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "token").write_text("secret")
+@pytest.mark.parametrize("words", [("serve", "--renderer", "identity", "--upstream", "host:1"), ("serve-policy", "lane-camera")])
+def test_callers_of_every_server_are_let_in_as_asked(called: Any, tmp_path: Path, words: tuple[str, ...]) -> None:
     files = ("--tls-cert", "cert.pem", "--tls-key", "key.pem", "--tls-client-ca", "callers.pem", "--token-file", str(tmp_path / "token"))
-    security = called(serve, "Host", "serve", "--renderer", "identity", "--upstream", "host:1", "--drain-s", "1", *files)["security"]
-    assert (security.certificate, security.key, security.client_ca) == (Path("cert.pem"), Path("key.pem"), Path("callers.pem"))
-    assert security.token == "secret"
+    given = called(serve if words[0] == "serve" else serve_policy, "Host", *words, "--drain-s", "1", "--expiry-s", "9", *files)["policy"]
+    assert (given.tls_cert, given.tls_key, given.tls_client_ca) == (Path("cert.pem"), Path("key.pem"), Path("callers.pem"))
+    assert (given.token_file, given.drain_s, given.expiry_s) == (tmp_path / "token", 1.0, 9.0)
 
 
 # --- from a dataclass to options ------------------------------------------------------------------------------------------

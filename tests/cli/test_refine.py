@@ -12,8 +12,7 @@ import pytest
 
 from alpasim_plugin.cli import refine
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.log.video_reader import VideoReader
-from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 
 @pytest.fixture

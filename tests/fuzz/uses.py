@@ -124,7 +124,7 @@ def use_training_run(folder: Path) -> None:
 
 
 def use_video(path: Path) -> None:
-    from alpasim_plugin.log.video_reader import VideoReader
+    from alpasim_plugin.log.video import VideoReader
 
     with VideoReader(path) as video:
         assert all(frame.image.ndim == 3 for frame in video)

@@ -28,8 +28,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 import alpasim_plugin.gym as doors  # noqa: E402
-from alpasim_plugin.gym.actions import HeldCommand  # noqa: E402
-from alpasim_plugin.gym.env import DriveEnv  # noqa: E402
+from alpasim_plugin.gym.env import DriveEnv, HeldCommand  # noqa: E402
 
 SMALL = "cameras=[{width: 64, height: 36}]"
 SHORT = ("timing.duration_us=1500000", "timing.warmup_us=300000")

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.asl import AslReader
-from alpasim_plugin.log.rename import Renaming, copy_log
-from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.log.asl import AslReader, Renaming, copy_log
+from alpasim_plugin.log.schema import session_uuid
 
 
 @pytest.fixture(scope="module")

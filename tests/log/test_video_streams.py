@@ -11,8 +11,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.log.video_reader import VideoReader
-from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 
 def picture(value: int = 120, height: int = 32, width: int = 48) -> U8:

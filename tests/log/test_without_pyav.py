@@ -11,7 +11,7 @@ import sys
 sys.modules["av"] = None
 import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runtime.refine, alpasim_plugin.lab.training.pair_import
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.log.video_reader import VideoReader
+from alpasim_plugin.log.video import VideoReader
 try:
     VideoReader(sys.argv[1])
 except InfrastructureError as error:

@@ -14,8 +14,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.log.video_reader import VideoReader
-from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.log.video import VideoReader, VideoWriter
 from alpasim_plugin.plugins.interfaces import BlockRule
 from alpasim_plugin.runtime.refine import RefineFiles, refine_video
 

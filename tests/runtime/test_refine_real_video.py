@@ -12,8 +12,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.log.video_reader import VideoReader
-from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 FREEWAY = "udacity/solidWhiteRight.mp4"
 STREET = "cosmos-transfer/posttrain/{}/ftheta_camera_front_wide_120fov/av_002b815b-7595-4d54-a9f4-4c62c83d3009_0.mp4"

@@ -31,7 +31,7 @@ license = "Apache-2.0"
 dependencies = ["grpcio>=1.62", "protobuf>=4.25,<7"]
 
 [project.scripts]
-onefixer-bridge = "{PACKAGE}.client.check:main"
+onefixer-bridge = "{PACKAGE}.client:main"
 
 [project.entry-points."alpasim.configs"]
 onefixer = "{PACKAGE}.configs"
@@ -51,10 +51,8 @@ def stage(target: Path) -> None:
         for path in sorted(source.rglob("*")):
             if path.suffix in SUFFIXES and path.name != "compile.py":
                 copy(path, package / name / path.relative_to(source))
-    client = (HERE / "client.py").read_text().replace("from ...wire", "from ..wire")  # there the messages lie one folder nearer
-    copy(HERE / "check.py", package / "client" / "check.py")
-    (package / "client" / "client.py").write_text(client)
-    (package / "client" / "__init__.py").write_text('"""A client of the renderer service, and a check of one."""\n')
+    client = (HERE / "client.py").read_text().replace("from ...wire", "from .wire")  # there the messages lie two folders nearer
+    (package / "client.py").write_text(client)
     (package / "__init__.py").write_text(INIT)
     (target / "pyproject.toml").write_text(PROJECT)
 

@@ -13,7 +13,7 @@ import grpc
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.wire import common_pb2
-from alpasim_plugin.wire.services import OPTIONS, Stub
+from alpasim_plugin.wire.services import OPTIONS, Stub, is_lost_connection
 
 READY_S = 30.0  # how long a service may take to accept its first call
 CALL_S = 300.0  # AlpaSim's own deadline of a render
@@ -68,7 +68,7 @@ class Service:
     Args:
         name: Name of the service, as in `alpasim_plugin.wire.SERVICE_PATHS`.
         target: ``HOST:PORT``.
-        error: Class of the errors that a failing call raises.
+        error: Class of the errors that a failing call raises; a lost connection is no policy's fault: `InfrastructureError`.
         retries: Whether a call that may pass is made again, as AlpaSim does with renders and not with drivers.
     """
 
@@ -89,11 +89,18 @@ class Service:
             found = f"nothing answers at {self.target} within {timeout_s:g} s"
             raise InfrastructureError(f"calling {self.name}", self.target, found, "start the service, or correct the address") from error
 
-    def call(self, method: str, request: Any, timeout_s: float = CALL_S) -> Any:
+    def call(self, method: str, request: Any, timeout_s: float = CALL_S, at_us: int | None = None) -> Any:
         """Make one call and return its answer.
+
+        Args:
+            method: Name of the call.
+            request: Its message.
+            timeout_s: How long the answer may take.
+            at_us: Simulated time, for messages.
 
         Raises:
             SimrunError: Of the class that the constructor was given: the service answered with an error status, or not in time.
+            InfrastructureError: Nobody listens there any more, or the connection was lost before the answer.
         """
         ask: Callable[..., Any] = getattr(self.stub, method)
         for wait_s in (*(RETRY_S if self._retries else ()), None):
@@ -103,11 +110,16 @@ class Service:
                 code, text = error.code(), error.details() or ""
                 passing = code == grpc.StatusCode.UNAVAILABLE or any(phrase in text for phrase in PASSING_TEXTS)
                 if wait_s is None or not passing:
-                    found = f"{code.name}: {text}"
-                    do_this = "see the service's own log"
-                    raise self._error(f"calling {self.name}.{method}", self.target, found, do_this) from error
+                    raise self._failure(error, method, at_us) from error
                 time.sleep(wait_s)
         raise AssertionError("the last attempt returns or raises")
+
+    def _failure(self, error: Any, method: str, at_us: int | None) -> SimrunError:
+        where = self.target if at_us is None else f"{self.target}, at {at_us} us of simulated time"
+        doing, found = f"calling {self.name}.{method}", f"{error.code().name}: {error.details() or ''}"
+        if not is_lost_connection(error) or issubclass(self._error, InfrastructureError):
+            return self._error(doing, where, found, "see the service's own log")
+        return InfrastructureError(doing, where, found, "see the service's own log, and drive the rollout again with --resume")
 
     def version(self) -> common_pb2.VersionId:
         """Return the service's version triple, once it is ready."""

@@ -10,22 +10,25 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import socket
 import tempfile
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from urllib.parse import parse_qs
 
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
-from alpasim_plugin.alpasim.client.listening import LoopbackPort, SocketFile
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.process.stdout import say
 from alpasim_plugin.process.subprocesses import Child, exit_reason
 
+MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
+LOOPBACK = "127.0.0.1"
 DOING = "starting a policy's command"
 DRIVING = "driving by a policy's command"
 VARIABLE = "SIMRUN_POLICY_ADDRESS"
@@ -33,6 +36,91 @@ READY_S = 120.0  # a container starts, a network is loaded
 POLL_S = 0.02
 REAP_S = 1.0  # between the end of a connection and that of the process behind it
 SHOWN_LINES = 3
+
+
+class Place(Protocol):
+    """Where a child shall listen."""
+
+    address: str  # as gRPC dials it
+
+    def filled_in(self, word: str) -> str:
+        """Return a word of the command with its place holders replaced."""
+        ...
+
+    def is_open(self) -> bool:
+        """Tell whether somebody accepts connections there."""
+        ...
+
+    def close(self) -> None:
+        """Give the place back."""
+        ...
+
+
+class SocketFile:
+    """A socket file in a folder of its own.
+
+    Raises:
+        InputError: Its path is too long for a socket.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, path = folder, folder / "policy.sock"
+        if len(str(path)) > MAX_PATH:
+            shutil.rmtree(folder)
+            found = f"{path} is longer than {MAX_PATH} characters"
+            raise InputError("choosing a socket", "the folder for temporary files", found, "set TMPDIR=/tmp, or name {port} in the command")
+        self._path, self.address = path, f"unix:{path}"
+
+    def filled_in(self, word: str) -> str:
+        """Replace ``{address}`` and ``{folder}``, the socket's folder, which a container must mount."""
+        return word.replace("{address}", self.address).replace("{folder}", str(self._folder))
+
+    def is_open(self) -> bool:
+        """Tell whether somebody accepts connections there."""
+        with socket.socket(socket.AF_UNIX) as one, suppress(OSError):
+            one.connect(str(self._path))
+            return True
+        return False
+
+    def close(self) -> None:
+        """Remove the folder; harmless if it is gone."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class LoopbackPort:
+    """A free port, kept from other processes of ours by a datagram socket of the same number.
+
+    gRPC lets two servers share a port, and between our choice and the child's listening another of us might choose the same.
+    """
+
+    def __init__(self) -> None:
+        while True:
+            with socket.socket() as free:
+                free.bind((LOOPBACK, 0))
+                self._port = int(free.getsockname()[1])
+            self._claim = socket.socket(type=socket.SOCK_DGRAM)
+            try:
+                self._claim.bind((LOOPBACK, self._port))
+            except OSError:
+                self._claim.close()
+                continue
+            break
+        self.address = f"{LOOPBACK}:{self._port}"
+
+    def filled_in(self, word: str) -> str:
+        """Replace ``{address}`` and ``{port}``."""
+        return word.replace("{address}", self.address).replace("{port}", str(self._port))
+
+    def is_open(self) -> bool:
+        """Tell whether somebody accepts connections there."""
+        with socket.socket() as one, suppress(OSError):
+            one.connect((LOOPBACK, self._port))
+            return True
+        return False
+
+    def close(self) -> None:
+        """Give the port's number back."""
+        self._claim.close()
 
 
 @dataclass(frozen=True)
@@ -182,8 +270,8 @@ class CommandPolicy(DriverPolicy):
     def _call(self, method: str, request: Any) -> Any:
         try:
             return super()._call(method, request)
-        except PolicyError as error:
-            self._served.require_running(REAP_S if "UNAVAILABLE" in error.found else 0.0)
+        except SimrunError as error:  # a connection is lost, too, where the command has ended: that is its own fault
+            self._served.require_running(0.0 if isinstance(error, PolicyError) else REAP_S)
             if "DEADLINE_EXCEEDED" in error.found:  # it hangs: the next rollout gets a new one
                 self._served.stop()
             raise

@@ -52,11 +52,13 @@ class DriverPolicy(Policy):
         version = self.service.version()
         self._facts: dict[str, Any] = {"driver": f"{version.version_id} at {place.target}"}
         self._session = ""
+        self._now_us: int | None = None
 
     def reset(self, seed: int, route: Route) -> None:
         """Open a session for a new rollout."""
         self._end_session()
         self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{self._scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}"))
+        self._now_us = None
         self._sent_us, self._image_us = -1, dict.fromkeys(self._cameras, -1)
         self._facts |= {"empty_plans": 0, "shortest_plan_s": None, "samples_cut": 0, "calls": 0}
         request = egodriver_pb2.DriveSessionRequest
@@ -75,9 +77,10 @@ class DriverPolicy(Policy):
         """Send what is new and return the driver's plan.
 
         Raises:
-            PolicyError: A call fails, the driver ends the session, its answer is no plan, or empty after the warm-up.
+            PolicyError: A call fails or takes too long, the driver ends the session, its answer is no plan, or empty after the warm-up.
+            InfrastructureError: The connection is lost.
         """
-        now = observation.t_us
+        now = self._now_us = observation.t_us
         self._send_images(observation.frames)
         self._send_motion(observation)
         points = [common_pb2.Vec3(x=x, y=y, z=0.0) for x, y, _ in observation.route_rig.tolist()]
@@ -167,7 +170,7 @@ class DriverPolicy(Policy):
 
     def _call(self, method: str, request: Any) -> Any:
         self._facts["calls"] = self._facts.get("calls", 0) + 1
-        return self.service.call(method, request, self._timeout_s)
+        return self.service.call(method, request, self._timeout_s, self._now_us)
 
 
 class AlpasimPolicy(DriverPolicy):

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.alpasim.client.channel import Service
-from alpasim_plugin.core.errors import PolicyError, SimrunError
+from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.wire import egodriver_pb2
 
 LIMIT_S = 0.1  # of a drive call, in the public challenge
@@ -146,6 +146,6 @@ def _open_and_close(service: Service, name: str, scene_id: str) -> None:
 def _tried(name: str, call: Callable[[], Any]) -> Finding:
     try:
         call()
-    except PolicyError as error:
+    except SimrunError as error:
         return Finding(name, "failed", error.found)
     return Finding(name, "passed", "answered")

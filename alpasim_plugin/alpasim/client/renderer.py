@@ -57,7 +57,7 @@ class NreRenderer(Renderer):
             name = self._names.get(request.camera.name, request.camera.name)
             message = wire_render_request(self._scene, request, self._encoding, name)
             items.append(sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=name, request=message))
-        answer = self._service.call("batch_render_rgb", sensorsim_pb2.BatchRGBRenderRequest(items=items))
+        answer = self._service.call("batch_render_rgb", sensorsim_pb2.BatchRGBRenderRequest(items=items), at_us=requests[0].t_us)
         got = {item.camera_name: item for item in answer.items}
         wanted = [item.camera_name for item in items]
         if sorted(got) != sorted(wanted) or len(answer.items) != len(wanted):

@@ -8,26 +8,56 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl
 
 import grpc
 
-from alpasim_plugin.alpasim.server.fixing import FixerShelf, resolve_served
+from alpasim_plugin import __version__
+from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, resolve_served
 from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
-from alpasim_plugin.alpasim.server.hosting import read_pem
-from alpasim_plugin.alpasim.server.reliability import read_masks
-from alpasim_plugin.alpasim.server.scenes import SceneShelf
+from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
-from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource
-from alpasim_plugin.alpasim.server.version import version_of
+from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource, read_masks
 from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.plugins.parts import RendererSpec
-from alpasim_plugin.plugins.parts.spec import file_digest
+from alpasim_plugin.plugins.parts.spec import digest, file_digest
+from alpasim_plugin.wire import api_version, common_pb2
 from alpasim_plugin.wire.services import OPTIONS, Stub
 
 DOING = "setting up a renderer service"
 RECONNECT = (("grpc.min_reconnect_backoff_ms", 200), ("grpc.initial_reconnect_backoff_ms", 200), ("grpc.max_reconnect_backoff_ms", 2000))
+
+
+def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb2.VersionId | None = None) -> common_pb2.VersionId:
+    """Return the triple of a service.
+
+    Args:
+        spec: Renderer and fixer.
+        settings: What else shapes the pictures: device, scenes, reliability, masks.
+        upstream: The upstream's own triple.
+
+    Returns:
+        ``version_id``: the product, then digests of weights, settings and code, then the upstream's id; ``git_hash``: one digest of all
+        of it, followed by the upstream's; the wire version is the upstream's where there is one.
+    """
+    part = spec.base if spec.fixer is None else spec.fixer
+    name = "identity" if spec.fixer is None and upstream is not None else spec.name
+    weights = digest(sorted(part.files.values()))
+    given = None if part.settings is None else part.settings.model_dump(mode="json")
+    base = None if upstream is not None else spec.base.digest
+    everything = digest([__version__, name, part.digest, base, given, settings])
+    short = f"weights={weights[:12]}" if part.files else "weights=none"
+    text = f"simrun-{__version__}+{name} {short} settings={digest([given, settings])[:12]} code={(part.digest or 'remote')[:12]}"
+    version = common_pb2.VersionId(version_id=text, git_hash=everything[:40])
+    if upstream is None:
+        version.grpc_api_version.CopyFrom(api_version())
+        return version
+    version.version_id = f"{text} over {upstream.version_id}"
+    version.git_hash = f"{everything[:40]}+{upstream.git_hash}"
+    version.grpc_api_version.CopyFrom(upstream.grpc_api_version)
+    return version
 
 
 @dataclass(frozen=True)
@@ -38,18 +68,36 @@ class Upstream:
         address: ``HOST:PORT``.
         ca: PEM file: talk TLS and trust what it signed; None: plain text.
         token: Sent as ``authorization: Bearer TOKEN``; only over TLS.
+        as_png: Ask for PNG whatever the caller wants, so that nothing is compressed twice.
     """
 
     address: str
     ca: Path | None = None
     token: str | None = None
+    as_png: bool = True
+
+    @classmethod
+    def parse(cls, text: str) -> Upstream:
+        """Read ``HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]``.
+
+        Raises:
+            InputError: Another option, or a file that cannot be read.
+        """
+        address, _, query = text.partition("?")
+        given = dict(parse_qsl(query, keep_blank_values=True))
+        known = {"ca", "token_file", "image"}
+        if not address or not set(given) <= known or given.get("image", "png") not in ("png", "as-asked"):
+            do_this = "write HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]"
+            raise InputError(DOING, f"--upstream {text}", "no address, or an option that is unknown", do_this)
+        ca, token = (Path(given[key]) if key in given else None for key in ("ca", "token_file"))
+        return cls(address, ca, read_token(token), given.get("image") != "as-asked")
 
     def channel(self) -> Any:
         """Open a channel."""
         options = [*OPTIONS, *RECONNECT]
         if self.ca is None:
             if self.token is not None:
-                raise InputError(DOING, f"upstream {self.address}", "a token over plain text", "give --upstream-ca as well")
+                raise InputError(DOING, f"upstream {self.address}", "a token over plain text", "give ?ca=FILE as well")
             return grpc.insecure_channel(self.address, options)
         credentials = grpc.ssl_channel_credentials(read_pem(self.ca))
         if self.token is not None:
@@ -70,7 +118,6 @@ class Settings:
         history_bytes, expiry_s: Bounds of the histories.
         reliability: Fixed trust in an upstream's frames; None: from the distance to the recorded path.
         masks: Grey masks by camera.
-        upstream_png: Ask the upstream for PNG whatever the caller wants.
         kept_scenes: Scenes that stay loaded.
     """
 
@@ -84,7 +131,6 @@ class Settings:
     expiry_s: float = 900.0
     reliability: float | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
-    upstream_png: bool = True
     kept_scenes: int = 4
 
 
@@ -94,8 +140,8 @@ class Assembled:
 
     service: Sensorsim
     world_model: WorldModel | None
-    shelf: SceneShelf | None
-    fixers: FixerShelf | None
+    scenes: SceneCache | None
+    fixers: FixerCache | None
     tree: HistoryTree[Answered]
     busy: threading.Lock
     spec: RendererSpec
@@ -116,7 +162,7 @@ class Assembled:
         """Forget what nobody used for long."""
         self.tree.expire()
         if self.world_model is not None:
-            self.world_model.expire()
+            self.world_model.sessions.expire()
 
 
 def assemble(settings: Settings) -> Assembled:
@@ -134,34 +180,34 @@ def assemble(settings: Settings) -> Assembled:
     if settings.upstream is None and (settings.masks or settings.reliability is not None):
         raise InputError(DOING, "--reliability, --mask", "our own renderer states its opacity", "use them with --upstream")
     busy = threading.Lock()
-    fixers = None if spec.fixer is None else FixerShelf(spec, settings.device, settings.threads)
+    fixers = None if spec.fixer is None else FixerCache(spec, settings.device, settings.threads)
     needs_map = fixers is not None and fixers.needs_map
     own = spec if settings.upstream is None else None
-    shelf = None
+    scenes = None
     if settings.scenes:
-        shelf = SceneShelf(settings.scenes, own, needs_map, settings.device, settings.threads, kept=settings.kept_scenes)
+        scenes = SceneCache(settings.scenes, own, needs_map, settings.device, settings.threads, kept=settings.kept_scenes)
     channel = None if settings.upstream is None else settings.upstream.channel()
     stub = None if channel is None else Stub(channel, "SensorsimService")
     source: FrameSource
     if stub is None:
-        assert shelf is not None
-        source = LocalSource(shelf, busy, settings.threads)
+        assert scenes is not None
+        source = LocalSource(scenes, busy, settings.threads)
     else:
         masks = read_masks(settings.masks)
-        source = UpstreamSource(stub, shelf, settings.reliability, masks, settings.upstream_png, settings.threads)
+        source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads)
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
     frames = FrameServer(source, fixers, tree, busy)
     shaping = {
         "device": settings.device,
         "reliability": settings.reliability,
         "masks": {camera: file_digest(path, f"mask of {camera}") for camera, path in settings.masks.items()},
-        "upstream_png": settings.upstream_png,
-        "maps": needs_map and shelf is not None,
+        "upstream_png": settings.upstream is None or settings.upstream.as_png,
+        "maps": needs_map and scenes is not None,
     }
-    service = Sensorsim(frames, partial(version_of, spec, shaping), shelf, stub, verbatim=stub is not None and fixers is None)
+    service = Sensorsim(frames, partial(version_of, spec, shaping), scenes, stub, verbatim=stub is not None and fixers is None)
     world_model = None
     if stub is None:
-        assert shelf is not None
+        assert scenes is not None
         version = version_of(spec, shaping)
-        world_model = WorldModel(shelf, fixers, busy, version, settings.threads, settings.expiry_s)
-    return Assembled(service, world_model, shelf, fixers, tree, busy, spec, channel)
+        world_model = WorldModel(scenes, fixers, busy, version, settings.threads, settings.expiry_s)
+    return Assembled(service, world_model, scenes, fixers, tree, busy, spec, channel)

@@ -1,22 +1,40 @@
-"""AlpaSim's EgodriverService in front of a policy of ours."""
+"""AlpaSim's EgodriverService in front of a policy of ours: sessions, what was submitted in each, and the plan that follows from it.
+
+Submissions may come in any order and from several threads. A query before every camera has a frame, or before any motion, is answered with
+an empty plan, which AlpaSim accepts in its warm-up.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from alpasim_plugin import __version__
-from alpasim_plugin.alpasim.server.driving import Driving
+from alpasim_plugin.alpasim.server.hosting import SESSIONS, Sessions
 from alpasim_plugin.alpasim.server.status import answering
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.alpasim.server.views import MAX_TIME_US
+from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
+from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
+from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory
+from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.schema import increasing_times, read_camera, read_poses, wire_trajectory
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.wire import api_version, common_pb2, egodriver_pb2
 
-DOING = "serving a policy"
+DOING = "driving for AlpaSim"
+ROUTE_POINTS = 20
+MOVING_MPS = 0.3  # AlpaSim sends zero speeds until it hands over; faster motion than this is believed against them
+SPEED_WINDOW_US = 200_000
+MOST_POSES = 8192  # of a session's motion; the oldest are forgotten
+MOST_CAMERAS = 64  # of a session
+KEPT_TIMES = 10_000  # newest drive calls whose time is kept
 
 
 class DriverService:
@@ -27,10 +45,13 @@ class DriverService:
         digest: Of its code and weights; None: it has none.
         make: Makes a session's policy for a scenario.
         scenario_of: Returns what a policy is made for, by scene id.
+        expiry_s: A session that nobody used for so long is closed.
         most_sessions: How many may be open at a time.
+        clock: Monotonic seconds.
 
     Attributes:
-        drives_s: Seconds of every answered query with a plan.
+        sessions: Those that are open.
+        drives_s: Seconds of the newest `KEPT_TIMES` queries that were answered.
         counts: Calls, and failed ones, by name.
     """
 
@@ -40,13 +61,14 @@ class DriverService:
         digest: str | None,
         make: Callable[[Scenario], Policy],
         scenario_of: Callable[[str], Scenario],
-        most_sessions: int = 64,
+        expiry_s: float = 900.0,
+        most_sessions: int = SESSIONS,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._name, self._digest = name, digest
-        self._make, self._scenario_of, self._most = make, scenario_of, most_sessions
-        self._sessions: dict[str, Driving] = {}
-        self._lock = threading.Lock()
-        self.drives_s: list[float] = []
+        self._make, self._scenario_of = make, scenario_of
+        self.sessions: Sessions[Driving] = Sessions(expiry_s, most_sessions, Driving.close, clock)
+        self.drives_s: deque[float] = deque(maxlen=KEPT_TIMES)
         self.counts: Counter[str] = Counter()
 
     @answering
@@ -60,23 +82,13 @@ class DriverService:
         """Open a session."""
         self.counts["start_session"] += 1
         scenario = self._scenario_of(request.debug_info.scene_id)
-        session = Driving(request, scenario, self._make)
-        with self._lock:
-            if request.session_uuid in self._sessions:
-                raise InputError(DOING, "start_session", f"session {request.session_uuid!r} is open already", "close it first")
-            if len(self._sessions) >= self._most:
-                found = f"{self._most} sessions are open"
-                raise InputError(DOING, "start_session", found, "close sessions that are over, or serve with a larger --sessions")
-            self._sessions[request.session_uuid] = session
+        self.sessions.open(request.session_uuid, Driving(request, scenario, self._make))
         return common_pb2.SessionRequestStatus()
 
     @answering
     def close_session(self, request: egodriver_pb2.DriveSessionCloseRequest, context: Any) -> common_pb2.Empty:
         """Close a session; one that is not open is no error, since AlpaSim closes after failures too."""
-        with self._lock:
-            session = self._sessions.pop(request.session_uuid, None)
-        if session is not None:
-            session.close()
+        self.sessions.close(request.session_uuid)
         return common_pb2.Empty()
 
     @answering
@@ -117,8 +129,172 @@ class DriverService:
         self.counts[f"{call} {code.name}"] += 1
 
     def _session(self, name: str) -> Driving:
-        with self._lock:
-            session = self._sessions.get(name)
+        session = self.sessions.get(name)
         if session is None:
-            raise InputError(DOING, f"session {name!r}", "it is not open", "call start_session first")
+            raise InputError("serving a policy", f"session {name!r}", "it is not open, or has expired", "call start_session first")
         return session
+
+
+class Driving:
+    """A session. What it keeps is bounded: the newest frame of each camera, and the newest `MOST_POSES` of the motion.
+
+    Args:
+        request: That opened it.
+        scenario: What a policy is made for; its cameras are replaced by the session's.
+        make: Makes the policy for a scenario.
+    """
+
+    def __init__(self, request: egodriver_pb2.DriveSessionRequest, scenario: Scenario, make: Callable[[Scenario], Policy]) -> None:
+        self._seed, self._scenario, self._make = int(request.random_seed), scenario, make
+        self._native = _pinholes(request.rollout_spec.vehicle.available_cameras)
+        self._lock = threading.Lock()
+        self._frames: dict[str, Frame] = {}
+        self._history = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+        self._state: Any = None
+        self._route_rig: F64 = np.full((ROUTE_POINTS, 3), np.nan)
+        self._policy: Policy | None = None
+        self._cameras: Mapping[str, CameraSpec] = {}
+
+    def take_image(self, image: egodriver_pb2.RolloutCameraImage.CameraImage) -> None:
+        """Keep a camera's newest frame.
+
+        Raises:
+            InputError: The session has no such camera, or it is no image.
+        """
+        if image.logical_id not in self._native:
+            found = f"an image of camera {image.logical_id!r}; the session has {sorted(self._native)}"
+            raise InputError(DOING, "submit_image_observation", found, "send only the cameras of the session")
+        check_time(image.frame_end_us, "submit_image_observation")
+        rgb = decode_image(image.image_bytes, f"camera {image.logical_id!r} at {image.frame_end_us} us")
+        with self._lock:
+            held = self._frames.get(image.logical_id)
+            if held is None or held.t_us <= image.frame_end_us:
+                self._frames[image.logical_id] = Frame(int(image.frame_end_us), image.logical_id, rgb)
+
+    def take_motion(self, message: egodriver_pb2.RolloutEgoTrajectory) -> None:
+        """Append poses; those at or before the newest one are left out."""
+        with self._lock:
+            known = self._history
+            newest = int(known.t_us[-1]) if len(known) else -1
+            new = [pose for pose in message.trajectory.poses if pose.timestamp_us > newest]
+            t_us = increasing_times([pose.timestamp_us for pose in new], "the ego's motion")
+            if new:
+                check_time(new[-1].timestamp_us, "submit_egomotion_observation")
+                xyz, quat = read_poses((pose.pose for pose in new), "the ego's motion")
+                pairs = (known.t_us, t_us), (known.xyz, xyz), (known.quat, quat)
+                self._history = Trajectory(*(np.concatenate(pair)[-MOST_POSES:] for pair in pairs))
+            if message.dynamic_states:
+                self._state = message.dynamic_states[-1]
+
+    def take_route(self, route: egodriver_pb2.Route) -> None:
+        """Keep the newest route; a row of NaN ends it."""
+        rows = np.array([(p.x, p.y, p.z) for p in route.waypoints[:ROUTE_POINTS]], dtype=np.float64).reshape(-1, 3)
+        with self._lock:
+            self._route_rig = np.full((ROUTE_POINTS, 3), np.nan)
+            self._route_rig[: len(rows)] = rows
+
+    def drive(self, now_us: int) -> egodriver_pb2.DriveResponse:
+        """Return the policy's plan as absolute poses; empty where it cannot be asked yet.
+
+        Raises:
+            InputError: A time beyond 2^62 us.
+            PolicyError: It returned no plan, or asks for cameras that the session does not have.
+        """
+        check_time(now_us, "drive")
+        with self._lock:
+            if not len(self._history) or len(self._frames) < len(self._native):
+                return egodriver_pb2.DriveResponse()
+            ego, history = self._ego(), self._history
+            policy = self._policy = self._policy or self._started(ego)
+            shown = {name: frame for name, frame in self._frames.items() if name in self._cameras}
+            observation = Observation(now_us, shown, self._cameras, replace(ego, t_us=now_us), history, self._route_rig.copy())
+            plan = policy.act(observation)
+            problem = plan_problem(plan, now_us)
+            if problem:
+                raise PolicyError(DOING, type(policy).__name__, problem, "simrun check-policy finds all faults of a policy")
+            return self._answer(plan, ego.T_world_rig)
+
+    def close(self) -> None:
+        """Give back what the policy holds."""
+        with self._lock:
+            if self._policy is not None:
+                self._policy.close()
+
+    def _started(self, ego: EgoState) -> Policy:
+        """Make the policy for the cameras as they come: an image may have another size than its calibration."""
+        cameras = [_resized(camera, self._frames[name]) for name, camera in self._native.items()]
+        known = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
+        route = Route(transform_points(ego.T_world_rig, known) if len(known) else ego.T_world_rig[None, :3, 3])
+        policy = self._make(replace(self._scenario, cameras=tuple(cameras), route=route))
+        found = sensors_problem(policy.sensors)
+        wanted = [] if found else [sensor.camera for sensor in policy.sensors]
+        missing = sorted(set(wanted) - set(self._native))
+        if found or missing:
+            found = found or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
+            raise PolicyError(DOING, type(policy).__name__, found, "name the session's cameras as the policy does: ?cameras=NAME,...")
+        self._cameras = {camera.name: camera for camera in cameras if camera.name in wanted}
+        policy.reset(self._seed, route)
+        return policy
+
+    def _ego(self) -> EgoState:
+        known, now = self._history, int(self._history.t_us[-1])
+        pose = se3(known.xyz[-1], known.quat[-1])
+        stated, turn, accel = (0.0, 0.0, 0.0)
+        if self._state is not None:
+            stated, turn = self._state.linear_velocity.x, self._state.angular_velocity.z
+            accel = self._state.linear_acceleration.x
+        earlier = max(int(np.searchsorted(known.t_us, now - SPEED_WINDOW_US, side="right")) - 1, 0)
+        dt_s = (now - int(known.t_us[earlier])) * 1e-6
+        if stated == 0.0 and dt_s > 0:
+            before = se3(known.xyz[earlier], known.quat[earlier])
+            seen = float((known.xyz[-1] - before[:3, 3]) @ pose[:3, 0]) / dt_s
+            if abs(seen) > MOVING_MPS:
+                stated, turn = seen, float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
+        return EgoState(now, pose, float(stated), float(accel), float(turn))
+
+    def _answer(self, plan: Plan, T_world_rig: F64) -> egodriver_pb2.DriveResponse:
+        wires = [_absolute(plan, xy_yaw, T_world_rig) for xy_yaw in (np.column_stack([plan.xy, plan.yaw]), *plan.samples)]
+        debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=wires[1:])
+        return egodriver_pb2.DriveResponse(trajectory=wires[0], debug_info=debug)
+
+
+def check_time(t_us: int, call: str) -> None:
+    """Raise `InputError` for a time that no rollout has: computing with it would overflow."""
+    if t_us >= MAX_TIME_US:
+        raise InputError(DOING, call, f"{t_us} us", "send a time below 2^62 microseconds")
+
+
+def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
+    yaw0, origin = yaw_of(T_world_rig), T_world_rig[:3, 3]
+    c, s = np.cos(yaw0), np.sin(yaw0)
+    xy = rows[:, :2] @ np.array([[c, s], [-s, c]]) + origin[:2]
+    xyz = np.column_stack([xy, np.full(len(rows), origin[2])])
+    return wire_trajectory(Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(rows[:, 2] + yaw0))), "the plan")
+
+
+def _pinholes(listed: Any) -> dict[str, CameraSpec]:
+    """Return the session's cameras.
+
+    Raises:
+        InputError: One is no ideal pinhole: policies of this package compute with pinholes. Or there are too many.
+    """
+    if len(listed) > MOST_CAMERAS:
+        raise InputError(DOING, "start_session", f"{len(listed)} cameras", f"name at most {MOST_CAMERAS}")
+    out: dict[str, CameraSpec] = {}
+    for camera in listed:
+        spec = read_camera(camera)
+        if spec is None:
+            kind = camera.intrinsics.WhichOneof("camera_param") or "no intrinsics"
+            do_this = "give the driver a pinhole view of it: runtime.extra_cameras in AlpaSim, or a renderer that serves pinholes"
+            raise InputError(DOING, f"camera {camera.logical_id!r}", f"{kind} with distortion", do_this)
+        out[camera.logical_id] = spec
+    return out
+
+
+def _resized(camera: CameraSpec, frame: Frame) -> CameraSpec:
+    """Return a camera at the size of its images."""
+    height, width = frame.rgb.shape[:2]
+    K = camera.K.copy()
+    K[0] *= width / camera.width
+    K[1] *= height / camera.height
+    return replace(camera, width=width, height=height, K=K)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from alpasim_plugin.alpasim.server.fixing import FixerShelf, size_of
+from alpasim_plugin.alpasim.server.caches import FixerCache, size_of
 from alpasim_plugin.alpasim.server.history import HistoryTree, Node
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
@@ -20,6 +20,7 @@ from alpasim_plugin.wire import sensorsim_pb2
 
 DOING = "answering a render request"
 ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}
+NODE_BYTES, OBJECT_BYTES = 4096, 512  # what a frame and each of its objects hold beside pictures and tensors, roughly
 QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
 
 
@@ -41,7 +42,7 @@ class FrameServer:
         busy: Held while something is computed.
     """
 
-    def __init__(self, source: FrameSource, fixers: FixerShelf | None, tree: HistoryTree[Answered], busy: threading.Lock) -> None:
+    def __init__(self, source: FrameSource, fixers: FixerCache | None, tree: HistoryTree[Answered], busy: threading.Lock) -> None:
         self.source, self.tree = source, tree
         self._fixers, self._busy = fixers, busy
         self._in_work: dict[bytes, threading.Event] = {}
@@ -97,7 +98,8 @@ class FrameServer:
             frame, after = self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, past)
             self.events.update(frame.events)
             answered = Answered(frame.rgb, after)
-            return self.tree.add(view, answered, size_of(answered), parent)
+            size = size_of(answered) + NODE_BYTES + OBJECT_BYTES * len(view.objects)
+            return self.tree.add(view, answered, size, parent)
 
     def _encoded(self, node: Node[Answered], form: tuple[int, float]) -> bytes:
         known = node.answers.get(form)

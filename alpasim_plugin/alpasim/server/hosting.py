@@ -1,40 +1,55 @@
-"""Host services on a port: health, reflection, TLS, a token, and an end that lets running calls finish."""
+"""How every server of this package is reached, by whom, and how much of it a caller may take: one policy, for `serve` and `serve-policy`.
+
+A caller may be hostile. So whatever lasts is bounded and ends: sessions here, messages that do not come and streams in `gate`.
+"""
 
 from __future__ import annotations
 
-import hmac
+import ipaddress
+import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from concurrent import futures
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Generic, TypeVar
 
 import grpc
 
+from alpasim_plugin.alpasim.server.gate import Gate, Health
+from alpasim_plugin.alpasim.server.status import Full
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.wire import SERVICE_PATHS, health_pb2
-from alpasim_plugin.wire.reflection import Reflection
-from alpasim_plugin.wire.services import OPTIONS, handlers
+from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.wire.services import OPTIONS, Reflection, handlers
 
 DOING = "opening a port"
-OPEN_CALLS = (SERVICE_PATHS["Health"],)  # a load balancer has no token
+CALLS = 512  # threads for calls that are worked on, or wait for that
+STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
+SESSIONS = 64  # sessions at a time
+UPKEEP_S = 2.0
+S = TypeVar("S")
+log = logging.getLogger("simrun.serve")
 
 
 @dataclass(frozen=True)
-class Security:
-    """How callers are let in.
+class HostPolicy:
+    """Who is let in, and how long what a caller leaves behind is kept.
 
     Attributes:
-        certificate, key: PEM files of this server; both or neither.
-        client_ca: PEM file: callers must show a certificate that it signed.
-        token: Callers must send ``authorization: Bearer TOKEN``.
+        tls_cert, tls_key: PEM files of this server; both or neither.
+        tls_client_ca: PEM file: callers must show a certificate that it signed.
+        token_file: Callers must send ``authorization: Bearer TOKEN``, with the text of this file.
+        expiry_s: Sessions and histories that nobody used for so long are forgotten.
+        drain_s: At the end, running calls have so long.
     """
 
-    certificate: Path | None = None
-    key: Path | None = None
-    client_ca: Path | None = None
-    token: str | None = None
+    tls_cert: Annotated[Path | None, Flag("PEM certificate of this server.")] = None
+    tls_key: Annotated[Path | None, Flag("PEM key of this server.")] = None
+    tls_client_ca: Annotated[Path | None, Flag("Callers must show a certificate signed by it.")] = None
+    token_file: Annotated[Path | None, Flag("File with the token that callers must send.")] = None
+    expiry_s: Annotated[float, Flag("Sessions and histories unused for so long are forgotten.", min=1.0)] = 900.0
+    drain_s: Annotated[float, Flag("At the end, wait so long for running calls.", min=0.0)] = 30.0
 
     def credentials(self) -> Any:
         """Return gRPC's server credentials, or None for plain text.
@@ -42,13 +57,18 @@ class Security:
         Raises:
             InputError: A file is missing, or one of certificate and key.
         """
-        if self.certificate is None and self.key is None and self.client_ca is None:
+        if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
             return None
-        if self.certificate is None or self.key is None:
+        if self.tls_cert is None or self.tls_key is None:
             raise InputError(DOING, "TLS", "one of certificate and key", "give --tls-cert and --tls-key")
-        ca = None if self.client_ca is None else read_pem(self.client_ca)
-        pair = read_pem(self.key), read_pem(self.certificate)
+        ca = None if self.tls_client_ca is None else read_pem(self.tls_client_ca)
+        pair = read_pem(self.tls_key), read_pem(self.tls_cert)
         return grpc.ssl_server_credentials([pair], root_certificates=ca, require_client_auth=ca is not None)
+
+    def warn(self, address: str) -> None:
+        """Log a warning if whoever can reach an address is served."""
+        if self.token_file is None and self.tls_client_ca is None and not is_local(address):
+            log.warning("%s is open to everybody who can reach it; see --token-file and --tls-client-ca", address)
 
 
 def read_pem(path: Path) -> bytes:
@@ -59,55 +79,101 @@ def read_pem(path: Path) -> bytes:
         raise InputError(DOING, str(path), error.strerror or str(error), "name a PEM file") from error
 
 
-class Health:
-    """The standard health service: the server as a whole (``""``) and every service by its public name."""
+def read_token(path: Path | None) -> str | None:
+    """Return the token in a file, without the space around it; None without a file.
 
-    def __init__(self, services: Mapping[str, object]) -> None:
-        self._names = {"", *(SERVICE_PATHS[name].strip("/") for name in services)}
-        self._serving = True
-        self._changed = threading.Condition()
-
-    def stop(self) -> None:
-        """Report NOT_SERVING from now on, to watchers as well."""
-        with self._changed:
-            self._serving = False
-            self._changed.notify_all()
-
-    def Check(self, request: health_pb2.HealthCheckRequest, context: Any) -> health_pb2.HealthCheckResponse:
-        """Answer once."""
-        if request.service not in self._names:
-            context.abort(grpc.StatusCode.NOT_FOUND, f"no service {request.service!r} here")
-        return health_pb2.HealthCheckResponse(status=self._status(request.service))
-
-    def Watch(self, request: health_pb2.HealthCheckRequest, context: Any) -> Iterator[health_pb2.HealthCheckResponse]:
-        """Answer now and whenever the answer changes; it changes once, at the end."""
-        yield health_pb2.HealthCheckResponse(status=self._status(request.service))
-        with self._changed:
-            while self._serving and context.is_active():
-                self._changed.wait(0.5)
-        yield health_pb2.HealthCheckResponse(status=self._status(request.service))
-
-    def _status(self, service: str) -> Any:
-        if service not in self._names:
-            return health_pb2.HealthCheckResponse.SERVICE_UNKNOWN
-        return health_pb2.HealthCheckResponse.SERVING if self._serving else health_pb2.HealthCheckResponse.NOT_SERVING
+    Raises:
+        InputError: It cannot be read, or is empty.
+    """
+    if path is None:
+        return None
+    try:
+        token = path.read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("reading a token", str(path), f"{error}", "name a readable text file") from error
+    if not token:
+        raise InputError("reading a token", str(path), "an empty file", "write the token into it")
+    return token
 
 
-class TokenCheck(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
-    """Refuse calls without the token."""
+def is_local(address: str) -> bool:
+    """Tell whether an address can only be reached from this machine.
 
-    def __init__(self, token: str) -> None:
-        self._wanted = f"Bearer {token}".encode()
-        refuse = grpc.unary_unary_rpc_method_handler(
-            lambda request, context: context.abort(grpc.StatusCode.UNAUTHENTICATED, "send metadata 'authorization: Bearer TOKEN'")
-        )
-        self._refuse = refuse
+    Example:
+        >>> [is_local(a) for a in ("127.0.0.1:50051", "[::1]:0", "unix:/tmp/a", "0.0.0.0:50051", "127.example.org:1")]
+        [True, True, True, False, False]
+    """
+    host = address.rpartition(":")[0].strip("[]")
+    if address.startswith("unix:") or host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
-    def intercept_service(self, continuation: Callable[[Any], Any], details: Any) -> Any:
-        """Hand the call on if it has the token."""
-        given = {key: value for key, value in details.invocation_metadata or ()}.get("authorization", "")
-        fine = hmac.compare_digest(given.encode() if isinstance(given, str) else given, self._wanted)
-        return continuation(details) if fine or details.method.startswith(OPEN_CALLS) else self._refuse
+
+class Sessions(Generic[S]):
+    """Open sessions by name: no more than a number of them, and none that nobody used for long.
+
+    Args:
+        expiry_s: One unused for so long is closed.
+        most: How many may be open at a time.
+        close: Gives back what a session holds.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        expiry_s: float = 900.0,
+        most: int = SESSIONS,
+        close: Callable[[S], None] = lambda session: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._expiry_s, self._most, self._close, self._clock = expiry_s, most, close, clock
+        self._open: dict[str, tuple[S, float]] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def open(self, name: str, session: S) -> None:
+        """Enter a session.
+
+        Raises:
+            InputError: One of that name is open.
+            Full: As many as may be are open.
+        """
+        self.expire()
+        with self._lock:
+            if name in self._open:
+                raise InputError("opening a session", f"session {name!r}", "it is open already", "close it first")
+            if len(self._open) >= self._most:
+                do_this = f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s (--expiry-s)"
+                raise Full("opening a session", f"session {name!r}", f"{self._most} sessions are open", do_this)
+            self._open[name] = session, self._clock()
+
+    def get(self, name: str) -> S | None:
+        """Return a session, which is used by that; None if it is not open."""
+        with self._lock:
+            if name not in self._open:
+                return None
+            session, _ = self._open[name]
+            self._open[name] = session, self._clock()
+            return session
+
+    def close(self, name: str) -> None:
+        """Close a session; one that is not open is fine."""
+        with self._lock:
+            found = self._open.pop(name, None)
+        if found is not None:
+            self._close(found[0])
+
+    def expire(self) -> None:
+        """Close the sessions that nobody used for long."""
+        with self._lock:
+            old = [name for name, (_, used_s) in self._open.items() if self._clock() - used_s > self._expiry_s]
+        for name in old:
+            self.close(name)
 
 
 class Host:
@@ -116,11 +182,12 @@ class Host:
     Args:
         services: Implementations by the name of the service (`SERVICE_PATHS`).
         listen: ``HOST:PORT``; port 0 takes a free one. Or ``unix:PATH``.
-        security: TLS and token.
-        workers: Calls that run at the same time; further ones wait.
-        every: Called every `every_s` seconds, such as to forget what is old.
+        policy: Who is let in.
+        workers: Calls that are worked on at the same time; further ones wait.
+        every: Called every `UPKEEP_S` seconds, such as to forget what is old.
 
     Raises:
+        InputError: An address that is none, or files of the policy that cannot be read.
         InfrastructureError: The port cannot be had.
     """
 
@@ -128,21 +195,19 @@ class Host:
         self,
         services: Mapping[str, object],
         listen: str,
-        security: Security = Security(),
+        policy: HostPolicy = HostPolicy(),
         workers: int = 16,
-        every: Callable[[], None] | None = None,
-        every_s: float = 5.0,
+        every: Callable[[], None] = lambda: None,
     ) -> None:
-        self.health = Health(services)
-        interceptors = () if security.token is None else (TokenCheck(security.token),)
+        self.health, self._gate = Health(services), Gate(read_token(policy.token_file), workers)
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does not retry. Calls wait instead.
-        pool = futures.ThreadPoolExecutor(workers, thread_name_prefix="serve")
-        self._server = grpc.server(pool, options=[*OPTIONS, ("grpc.so_reuseport", 0)], interceptors=interceptors)
+        options = [*OPTIONS, ("grpc.so_reuseport", 0), ("grpc.max_concurrent_streams", STREAMS)]
+        self._server = grpc.server(ThreadPoolExecutor(CALLS, thread_name_prefix="serve"), options=options, interceptors=(self._gate,))
         made = [handlers(name, service) for name, service in services.items()]
         self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers()))
         host, _, port = listen.rpartition(":")
         is_socket = listen.startswith("unix:")
-        credentials = security.credentials()
+        credentials = policy.credentials()
         try:
             if not is_socket and (not host or not port.isdigit()):
                 raise InputError(DOING, f"--listen {listen}", "no HOST:PORT", "write for example 127.0.0.1:50051, or unix:PATH")
@@ -150,16 +215,14 @@ class Host:
         except RuntimeError as error:
             raise InfrastructureError(DOING, listen, str(error), "choose a free port and an address of this machine") from error
         self.address = listen if is_socket else f"{host}:{add}"
-        self._ended = threading.Event()
-        self._every, self._every_s = every, every_s
-        self._upkeep: threading.Thread | None = None
+        policy.warn(self.address)
+        self._ended, self._every = threading.Event(), every
+        self._upkeep = threading.Thread(target=self._repeat, daemon=True, name="serve-upkeep")
 
     def start(self) -> Host:
         """Accept calls."""
         self._server.start()
-        if self._every is not None:
-            self._upkeep = threading.Thread(target=self._repeat, daemon=True, name="serve-upkeep")
-            self._upkeep.start()
+        self._upkeep.start()
         return self
 
     def wait(self) -> None:
@@ -171,8 +234,9 @@ class Host:
         """Refuse new calls (UNAVAILABLE), let running ones finish within ``drain_s``, and close the port."""
         self.health.stop()
         self._server.stop(drain_s).wait()
+        self._gate.close()
         self._ended.set()
-        if self._upkeep is not None:
+        if self._upkeep.is_alive():
             self._upkeep.join()
 
     def __enter__(self) -> Host:
@@ -182,17 +246,6 @@ class Host:
         self.stop(0.0 if failure[0] is not None else 5.0)
 
     def _repeat(self) -> None:
-        assert self._every is not None
-        while not self._ended.wait(self._every_s):
+        while not self._ended.wait(UPKEEP_S):
+            self._gate.expire()
             self._every()
-
-
-def is_loopback(listen: str) -> bool:
-    """Tell whether an address can only be reached from this machine.
-
-    Example:
-        >>> is_loopback("127.0.0.1:50051"), is_loopback("[::1]:0"), is_loopback("0.0.0.0:50051")
-        (True, True, False)
-    """
-    host = listen.rpartition(":")[0]
-    return host in ("localhost", "[::1]") or host.startswith("127.")

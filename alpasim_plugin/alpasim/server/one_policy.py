@@ -52,8 +52,8 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
         made: Policy = complete(factory(scenario=scenario) if takes_scenario else factory(), Policy, f"policy {name!r}")
         return made
 
-    host = Host({"EgodriverService": _Serving(name, _file_digest(factory), make, _unknown_scene)}, place)
-    with host:
+    service = _Serving(name, _file_digest(factory), make, _unknown_scene)
+    with Host({"EgodriverService": service}, place, every=service.sessions.expire) as host:
         host.wait()
 
 
@@ -74,7 +74,7 @@ def _file_digest(factory: Callable[..., Any]) -> str | None:
     """Return the SHA-256 of the file that defines the policy, for `get_version`."""
     try:
         file = inspect.getsourcefile(factory)
-    except TypeError:
+    except (TypeError, OSError):  # no Python source: a built-in, or typed after -c
         return None
     if file is None or not os.path.isfile(file):
         return None

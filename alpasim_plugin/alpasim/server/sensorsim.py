@@ -7,10 +7,9 @@ from typing import Any, TypeVar
 
 import grpc
 
-from alpasim_plugin.alpasim.server.failures import Failures
+from alpasim_plugin.alpasim.server.caches import SceneCache, advertised
 from alpasim_plugin.alpasim.server.frames import FrameServer
-from alpasim_plugin.alpasim.server.scenes import SceneShelf, advertised
-from alpasim_plugin.alpasim.server.status import CallTime, answering
+from alpasim_plugin.alpasim.server.status import CallTime, Failures, answering
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.schema import wire_trajectory
 from alpasim_plugin.wire import common_pb2, sensorsim_pb2
@@ -25,7 +24,7 @@ class Sensorsim(Failures):
     Args:
         frames: Answers the render calls.
         version: Returns the triple to report, given the upstream's.
-        shelf: The scenes; None: all questions about scenes go to the upstream.
+        scenes: The scenes; None: all questions about scenes go to the upstream.
         upstream: Stub of the upstream's service; None: there is none.
         verbatim: Hand every call on as it came, without a fixer in between: images come back bit by bit.
     """
@@ -34,20 +33,19 @@ class Sensorsim(Failures):
         self,
         frames: FrameServer,
         version: Callable[[common_pb2.VersionId | None], common_pb2.VersionId],
-        shelf: SceneShelf | None,
+        scenes: SceneCache | None,
         upstream: Any = None,
         verbatim: bool = False,
     ) -> None:
         super().__init__()
-        self.frames, self._version, self._shelf, self._upstream, self._verbatim = frames, version, shelf, upstream, verbatim
+        self.frames, self._version, self._scenes, self._upstream, self._verbatim = frames, version, scenes, upstream, verbatim
 
     @answering
     def render_rgb(self, request: sensorsim_pb2.RGBRenderRequest, context: Any) -> sensorsim_pb2.RGBRenderReturn:
         """Render one frame."""
         left = CallTime(context)
         if self._verbatim:
-            handed_on: sensorsim_pb2.RGBRenderReturn = self._upstream.render_rgb(request, timeout=left.left_s())
-            return handed_on
+            return self._pass("render_rgb", request, context, sensorsim_pb2.RGBRenderReturn)
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self.frames.answers([request], left)[0])
 
     @answering
@@ -58,8 +56,7 @@ class Sensorsim(Failures):
         if len(set(names)) < len(names):
             raise InputError(DOING, f"a batch of {names}", "a camera name twice", "send one item a camera")
         if self._verbatim:
-            handed_on: sensorsim_pb2.BatchRGBRenderReturn = self._upstream.batch_render_rgb(request, timeout=left.left_s())
-            return handed_on
+            return self._pass("batch_render_rgb", request, context, sensorsim_pb2.BatchRGBRenderReturn)
         images = self.frames.answers([item.request for item in request.items], left)
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
         made = [item(camera_name=n, result=result(image_bytes=i), success=True) for n, i in zip(names, images, strict=True)]
@@ -70,13 +67,12 @@ class Sensorsim(Failures):
         """Render frames and lidar spins together; lidar and the renderer's data for the driver are the upstream's."""
         left = CallTime(context)
         if self._verbatim:
-            handed_on: sensorsim_pb2.AggregatedRenderReturn = self._upstream.render_aggregated(request, timeout=left.left_s())
-            return handed_on
+            return self._pass("render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn)
         if self._upstream is None:
             if request.lidar_requests:
                 raise NotHere("lidar")
             return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=self._returns(request, left))
-        reply: sensorsim_pb2.AggregatedRenderReturn = self._upstream.render_aggregated(request, timeout=left.left_s())
+        reply = self._pass("render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn)
         if request.rgb_requests:
             del reply.rgb_returns[:]
             reply.rgb_returns.extend(self._returns(request, left))
@@ -99,29 +95,29 @@ class Sensorsim(Failures):
     def get_available_scenes(self, request: common_pb2.Empty, context: Any) -> common_pb2.AvailableScenesReturn:
         """Return the scene ids: those of ``--scenes``, and only those that the upstream has as well."""
         if self._upstream is None:
-            assert self._shelf is not None
-            return common_pb2.AvailableScenesReturn(scene_ids=self._shelf.ids)
+            assert self._scenes is not None
+            return common_pb2.AvailableScenesReturn(scene_ids=self._scenes.ids)
         theirs = self._pass("get_available_scenes", request, context, common_pb2.AvailableScenesReturn)
-        if self._shelf is None or self._verbatim:
+        if self._scenes is None or self._verbatim:
             return theirs
         known = set(theirs.scene_ids)
-        return common_pb2.AvailableScenesReturn(scene_ids=[i for i in self._shelf.ids if i in known or "*" in known])
+        return common_pb2.AvailableScenesReturn(scene_ids=[i for i in self._scenes.ids if i in known or "*" in known])
 
     @answering
     def get_loaded_scenes(self, request: common_pb2.Empty, context: Any) -> sensorsim_pb2.LoadedScenesReturn:
         """Return the scenes in memory; each serves any number of rollouts."""
         if self._upstream is not None:
             return self._pass("get_loaded_scenes", request, context, sensorsim_pb2.LoadedScenesReturn)
-        assert self._shelf is not None
+        assert self._scenes is not None
         entry = sensorsim_pb2.LoadedSceneEntry
-        scenes = [entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1) for name in self._shelf.loaded]
-        return sensorsim_pb2.LoadedScenesReturn(scenes=scenes, loaded_instance_capacity=self._shelf.kept)
+        scenes = [entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1) for name in self._scenes.loaded]
+        return sensorsim_pb2.LoadedScenesReturn(scenes=scenes, loaded_instance_capacity=self._scenes.kept)
 
     @answering
     def prefetch_scene(self, request: sensorsim_pb2.ScenePrefetchRequest, context: Any) -> common_pb2.Empty:
         """Load and build a scene before its first frame is asked for; the call is forwarded to an upstream that implements it."""
-        if self._shelf is not None:
-            self._shelf.get(request.scene_id)
+        if self._scenes is not None:
+            self._scenes.get(request.scene_id)
         if self._upstream is not None:
             try:
                 self._upstream.prefetch_scene(request, timeout=CallTime(context).left_s())
@@ -135,8 +131,8 @@ class Sensorsim(Failures):
         """Return a scene's cameras."""
         if self._upstream is not None:
             return self._pass("get_available_cameras", request, context, sensorsim_pb2.AvailableCamerasReturn)
-        assert self._shelf is not None
-        return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(self._shelf.get(request.scene_id).scenario))
+        assert self._scenes is not None
+        return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(self._scenes.get(request.scene_id).scenario))
 
     @answering
     def get_available_trajectories(
@@ -145,8 +141,8 @@ class Sensorsim(Failures):
         """Return a scene's recorded ego path, local to rig."""
         if self._upstream is not None:
             return self._pass("get_available_trajectories", request, context, sensorsim_pb2.AvailableTrajectoriesReturn)
-        assert self._shelf is not None
-        recorded = wire_trajectory(self._shelf.get(request.scene_id).scenario.ego_log, f"recorded path of scene {request.scene_id!r}")
+        assert self._scenes is not None
+        recorded = wire_trajectory(self._scenes.get(request.scene_id).scenario.ego_log, f"recorded path of scene {request.scene_id!r}")
         listed = sensorsim_pb2.AvailableTrajectoriesReturn.AvailableTrajectory(trajectory=recorded)
         return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[listed])
 

@@ -1,23 +1,32 @@
-"""Where frames come from before they are fixed: our own renderer, or any server of AlpaSim's renderer service."""
+"""Where frames come from before they are fixed: our own renderer, or any server of AlpaSim's renderer service.
+
+An upstream's images come without opacity, which the fixer reads as trust: from 0.98 on an opaque pixel is kept against a large change
+without support, below 0.9 the generator is free, below 0.5 noise enters. So the estimate of a whole frame falls linearly from 1 to `FAR`
+while the rig moves away from the recorded path, from `NEAR_M` to `FAR_M` (a reconstruction knows what the recording saw), and a mask lowers
+it further where it is dark:
+
+    opacity(pixel) = min(path(distance), mask(pixel) / 255)
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import grpc
 import numpy as np
 
-from alpasim_plugin.alpasim.server import reliability
-from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
-from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf
+from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import View
+from alpasim_plugin.alpasim.server.views import Lens, View, read_lens
 from alpasim_plugin.core.errors import InputError, SimrunError
-from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.core.types import F64, U8, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.core.geometry import interpolate, inverse, project
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.runtime.guards import checked_frames
@@ -25,7 +34,45 @@ from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import actor_boxes
 from alpasim_plugin.wire import sensorsim_pb2
 
+NEAR_M, FAR_M = 0.25, 3.0  # distance from the recorded path where trust begins to fall, and where it has fallen
+FAR = 0.6  # above 0.5: a hole is never invented
+ESTIMATING = "estimating the reliability of an upstream's frame"
 DOING = "rendering a requested frame"
+MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
+
+
+def path_reliability(path_xy: F64, xy: F64) -> float:
+    """Return the trust in a frame seen from ``xy`` ``(2,)`` beside the recorded path ``(N, 2)``, metres.
+
+    Example:
+        >>> path = np.array([[0.0, 0.0], [100.0, 0.0]])
+        >>> [round(path_reliability(path, np.array([50.0, y])), 3) for y in (0.1, 1.625, -9.0)]
+        [1.0, 0.8, 0.6]
+    """
+    away = abs(project(path_xy, xy)[1])
+    share = min(max((away - NEAR_M) / (FAR_M - NEAR_M), 0.0), 1.0)
+    return 1.0 - share * (1.0 - FAR)
+
+
+def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
+    """Read grey masks ``(H, W)`` by camera: 255 is trusted.
+
+    Raises:
+        InputError: A file that is no picture.
+    """
+    return {camera: np.asarray(read_image(path, ESTIMATING, flag=cv2.IMREAD_GRAYSCALE)) for camera, path in named.items()}
+
+
+def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F32:
+    """Return the opacity ``(H, W)`` that stands for a frame's trust."""
+    if not 0.0 <= trust <= 1.0:
+        raise InputError(ESTIMATING, "the reliability", f"{trust}", "give a number from 0 to 1")
+    out = np.full((height, width), trust, dtype=np.float32)
+    if mask is not None:
+        out = np.minimum(out, cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0)
+    return out
+
+
 Request = sensorsim_pb2.RGBRenderRequest
 
 
@@ -75,13 +122,13 @@ class LocalSource:
     """Render scenes here, through the lens of the request, at the pose of the shutter's end.
 
     Args:
-        shelf: Scenes with their renderers.
+        scenes: Scenes with their renderers.
         busy: Held while something is computed: renderers are no more than one at a time.
         threads: Threads of the map rasteriser.
     """
 
-    def __init__(self, shelf: SceneShelf, busy: threading.Lock, threads: int | None = None) -> None:
-        self._shelf, self._busy, self._threads = shelf, busy, threads
+    def __init__(self, scenes: SceneCache, busy: threading.Lock, threads: int | None = None) -> None:
+        self._scenes, self._busy, self._threads = scenes, busy, threads
 
     def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
         """Return one frame a request, in order.
@@ -94,8 +141,8 @@ class LocalSource:
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
         lens = read_lens(request.camera_intrinsics, view.width, view.height)
-        entry = self._shelf.get(view.scene_id)
-        assert entry.renderer is not None, "a shelf without a renderer serves maps only"
+        entry = self._scenes.get(view.scene_id)
+        assert entry.renderer is not None, "scenes without a renderer are for maps only"
         camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
         asked = RenderRequest(view.t_us, camera, view.T_world_camera, boxes_at(entry, view))
         with left.holding(self._busy):
@@ -109,7 +156,7 @@ class UpstreamSource:
 
     Args:
         stub: Of ``SensorsimService`` at the upstream.
-        shelf: Scenes for maps and recorded paths; None: no map, and the path is asked of the upstream.
+        scenes: Scenes for maps and recorded paths; None: no map, and the path is asked of the upstream.
         trust: A fixed reliability from 0 to 1; None: from the distance to the recorded path (`reliability`).
         masks: Grey masks by camera.
         as_png: Ask for PNG whatever the caller asked for, so that the picture is not compressed twice.
@@ -119,13 +166,13 @@ class UpstreamSource:
     def __init__(
         self,
         stub: Any,
-        shelf: SceneShelf | None,
+        scenes: SceneCache | None,
         trust: float | None = None,
         masks: Mapping[str, U8] | None = None,
         as_png: bool = True,
         threads: int | None = None,
     ) -> None:
-        self._stub, self._shelf, self._trust, self._masks = stub, shelf, trust, masks or {}
+        self._stub, self._scenes, self._trust, self._masks = stub, scenes, trust, masks or {}
         self._as_png, self._threads, self._has_batch = as_png, threads, True
         self._paths: dict[str, F64] = {}
         self._mounts: dict[tuple[str, str], F64] = {}
@@ -170,10 +217,10 @@ class UpstreamSource:
     def _rendered(self, request: Request, view: View, data: bytes, left: CallTime) -> Rendered:
         rgb = decoded(data, f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us")
         height, width = rgb.shape[:2]
-        alpha = reliability.opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
+        alpha = trusted_opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
         sdmap = None
-        if self._shelf is not None:
-            entry = self._shelf.get(view.scene_id)
+        if self._scenes is not None:
+            entry = self._scenes.get(view.scene_id)
             lens = read_lens(without_windshield(request.camera_intrinsics), width, height)
             sdmap = drawn_map(entry, view, lens, lens.spec(view.camera, np.eye(4)), self._threads)
         return Rendered(Frame(view.t_us, view.camera, rgb, alpha), sdmap)
@@ -182,18 +229,19 @@ class UpstreamSource:
         if self._trust is not None:
             return self._trust
         T_world_rig = view.T_world_camera[1] @ inverse(self._mount(view, left))
-        return reliability.path_reliability(self._path(view, left), T_world_rig[:2, 3])
+        return path_reliability(self._path(view, left), T_world_rig[:2, 3])
 
     def _path(self, view: View, left: CallTime) -> F64:
         if view.scene_id not in self._paths:
-            if self._shelf is not None:
-                path = self._shelf.get(view.scene_id).scenario.ego_log.xyz
+            forget_if_many(self._paths)
+            if self._scenes is not None:
+                path = self._scenes.get(view.scene_id).scenario.ego_log.xyz
             else:
                 asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=view.scene_id)
                 listed = self._stub.get_available_trajectories(asked, timeout=left.left_s()).available_trajectories
                 if not listed or len(listed[0].trajectory.poses) < 2:
                     do = "give --scenes with the scene's file, or a fixed --reliability"
-                    raise InputError(reliability.DOING, f"scene {view.scene_id!r}", "the upstream lists no recorded path", do)
+                    raise InputError(ESTIMATING, f"scene {view.scene_id!r}", "the upstream lists no recorded path", do)
                 path = read_trajectory(listed[0].trajectory, f"recorded path of scene {view.scene_id!r}").xyz
             self._paths[view.scene_id] = path[:, :2]
         return self._paths[view.scene_id]
@@ -201,11 +249,18 @@ class UpstreamSource:
     def _mount(self, view: View, left: CallTime) -> F64:
         key = view.scene_id, view.camera
         if key not in self._mounts:
+            forget_if_many(self._mounts)
             asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=view.scene_id)
             for camera in self._stub.get_available_cameras(asked, timeout=left.left_s()).available_cameras:
                 self._mounts[view.scene_id, camera.logical_id] = read_transform(camera.rig_to_camera, f"mount of {camera.logical_id!r}")
             self._mounts.setdefault(key, np.eye(4))  # a camera of the runtime's own: its place counts instead of the rig's
         return self._mounts[key]
+
+
+def forget_if_many(known: dict[Any, Any]) -> None:
+    """Empty what is remembered by names that come from requests, before it grows without end."""
+    if len(known) >= MOST_NAMES:
+        known.clear()
 
 
 def mount_of(entry: SceneEntry, view: View) -> F64:

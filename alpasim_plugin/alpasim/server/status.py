@@ -6,8 +6,10 @@ may pass (an upstream that is away, busy, or sent a broken picture) is UNAVAILAB
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -16,17 +18,22 @@ from typing import Any
 import grpc
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.wire.services import is_lost_connection
 
 Code = grpc.StatusCode
 BACKEND = "Stopped waiting for backend"
-#: Statuses of an upstream that a second attempt may not meet again.
-PASSING = (Code.UNAVAILABLE, Code.RESOURCE_EXHAUSTED, Code.ABORTED, Code.CANCELLED, Code.DEADLINE_EXCEEDED)
-BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
+#: Statuses of an upstream that a second attempt may not meet again, beside those of a lost connection.
+PASSING = (Code.RESOURCE_EXHAUSTED, Code.ABORTED, Code.DEADLINE_EXCEEDED)
+log = logging.getLogger("simrun.serve")
 POLL_S = 0.1
 
 
 class UnknownScene(InputError):
     """A scene id that the server does not know."""
+
+
+class Full(InfrastructureError):
+    """There is as much of something as there may be."""
 
 
 class UpstreamFault(InfrastructureError):
@@ -65,8 +72,8 @@ class CallTime:
         return left
 
     @contextmanager
-    def holding(self, lock: threading.Lock) -> Iterator[None]:
-        """Hold a lock; waiting ends with the call's time."""
+    def holding(self, lock: threading.Lock | threading.Semaphore) -> Iterator[None]:
+        """Hold a lock, or a place of a semaphore; waiting ends with the call's time."""
         while True:
             left = self.left_s()
             if lock.acquire(timeout=POLL_S if left is None else min(left, POLL_S)):
@@ -88,12 +95,13 @@ def status_of(error: Exception) -> tuple[Any, str]:
         code, text = error.code(), error.details() or ""
         if BACKEND in text:
             return code, text
-        passing = code in PASSING or (code in (Code.UNKNOWN, Code.INTERNAL) and any(sign in text for sign in BROKEN_TRANSPORT))
-        return (Code.UNAVAILABLE if passing else code), f"upstream: {code.name}: {text}"
+        return (Code.UNAVAILABLE if code in PASSING or is_lost_connection(error) else code), f"upstream: {code.name}: {text}"
     if isinstance(error, Late):
         return Code.CANCELLED, str(error)
     if isinstance(error, UnknownScene):
         return Code.NOT_FOUND, one_line(error)
+    if isinstance(error, Full):
+        return Code.RESOURCE_EXHAUSTED, one_line(error)
     if isinstance(error, UpstreamFault):
         return Code.UNAVAILABLE, one_line(error)
     if isinstance(error, InputError):
@@ -121,3 +129,16 @@ def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any],
             context.abort(code, text)
 
     return answer
+
+
+class Failures:
+    """Counts and logs the calls that failed."""
+
+    def __init__(self) -> None:
+        self.statuses: Counter[str] = Counter()
+
+    def failed(self, call: str, code: Any, text: str, error: Exception) -> None:
+        """Note a failed call; an unforeseen error is logged with its traceback."""
+        self.statuses[code.name] += 1
+        foreseen = code is not Code.INTERNAL
+        log.warning("%s: %s: %s", call, code.name, text, exc_info=None if foreseen else error)

@@ -21,12 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.alpasim.server.failures import Failures
-from alpasim_plugin.alpasim.server.fixing import FixerShelf
-from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
-from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf
-from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene, answering
-from alpasim_plugin.alpasim.server.views import read_pose
+from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, SceneEntry
+from alpasim_plugin.alpasim.server.hosting import Sessions
+from alpasim_plugin.alpasim.server.status import CallTime, Failures, UnknownScene, answering
+from alpasim_plugin.alpasim.server.views import Lens, read_lens, read_pose
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
@@ -62,7 +60,6 @@ class Session:
     cameras: list[tuple[str, Lens, CameraSpec]]
     with_map: bool
     with_rgb: bool
-    used_s: float
     past: dict[str, Any] = field(default_factory=dict)
     end_us: int | None = None
     last: tuple[bytes, video_model_pb2.VideoChunkReturn] | None = None
@@ -73,7 +70,7 @@ class WorldModel(Failures):
     """The service.
 
     Args:
-        shelf: Scenes with renderers.
+        scenes: Scenes with renderers.
         fixers: Fixes; None: frames are given as rendered.
         busy: Held while something is computed, shared with the renderer service.
         version: The triple to report.
@@ -84,8 +81,8 @@ class WorldModel(Failures):
 
     def __init__(
         self,
-        shelf: SceneShelf,
-        fixers: FixerShelf | None,
+        scenes: SceneCache,
+        fixers: FixerCache | None,
         busy: threading.Lock,
         version: common_pb2.VersionId,
         threads: int | None = None,
@@ -93,20 +90,8 @@ class WorldModel(Failures):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__()
-        self._shelf, self._fixers, self._busy, self._version, self._threads = shelf, fixers, busy, version, threads
-        self._expiry_s, self._clock = expiry_s, clock
-        self._sessions: dict[str, Session] = {}
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self._sessions)
-
-    def expire(self) -> None:
-        """Forget the sessions that nobody used for long."""
-        with self._lock:
-            old = [name for name, session in self._sessions.items() if self._clock() - session.used_s > self._expiry_s]
-            for name in old:
-                del self._sessions[name]
+        self._scenes, self._fixers, self._busy, self._version, self._threads = scenes, fixers, busy, version, threads
+        self.sessions: Sessions[Session] = Sessions(expiry_s, clock=clock)
 
     @answering
     def get_version(self, request: common_pb2.Empty, context: Any) -> common_pb2.VersionId:
@@ -130,34 +115,33 @@ class WorldModel(Failures):
             check_image(frame.data, f"{what}, its initial frame", DOING)
             lens = read_lens(spec, spec.resolution_w, spec.resolution_h)
             cameras.append((spec.logical_id, lens, lens.spec(spec.logical_id, read_pose(mount, what) @ FLU_FROM_CAMERA)))
-        self._shelf.get(scene_id)  # built now: a chunk has no deadline, but a rollout waits for it
+        self._scenes.get(scene_id)  # built now: a chunk has no deadline, but a rollout waits for it
         session = Session(
-            scene_id, request.random_seed, cameras, request.debug_options.return_hdmap_frames,
-            not request.debug_options.skip_video_generation, self._clock(),
-        )  # fmt: skip
+            scene_id,
+            request.random_seed,
+            cameras,
+            request.debug_options.return_hdmap_frames,
+            not request.debug_options.skip_video_generation,
+        )
         name = uuid.uuid4().hex
-        with self._lock:
-            self._sessions[name] = session
+        self.sessions.open(name, session)
         return video_model_pb2.SessionId(session_id=name)
 
     @answering
     def close_session(self, request: video_model_pb2.SessionCloseRequest, context: Any) -> common_pb2.Empty:
         """End a rollout; a session that is unknown or closed is fine."""
-        with self._lock:
-            self._sessions.pop(request.session_id, None)
+        self.sessions.close(request.session_id)
         return common_pb2.Empty()
 
     @answering
     def render_video_chunk(self, request: video_model_pb2.VideoChunkRequest, context: Any) -> video_model_pb2.VideoChunkReturn:
         """Return one frame for every pose, of every camera."""
         left = CallTime(context)
-        with self._lock:
-            session = self._sessions.get(request.session_id.session_id)
+        session = self.sessions.get(request.session_id.session_id)
         if session is None:
             found = "it is unknown, closed or expired"
             raise UnknownScene(DOING, f"session {request.session_id.session_id!r}", found, "start a session first")
         with left.holding(session.lock):
-            session.used_s = self._clock()
             data = request.SerializeToString(deterministic=True)
             if session.last is None or session.last[0] != data:
                 session.last = data, self._chunk(session, request, left)
@@ -170,7 +154,7 @@ class WorldModel(Failures):
         before = [*([] if session.end_us is None else [session.end_us]), *times[:-1]]
         if any(b >= t for b, t in zip(before, times[-len(before) :] if before else [], strict=True)):
             raise InputError(DOING, f"session of {session.scene_id!r}", f"times {times} after {session.end_us}", "give times that increase")
-        entry = self._shelf.get(session.scene_id)
+        entry = self._scenes.get(session.scene_id)
         rig = [read_pose(pose.pose, f"rig pose at {pose.timestamp_us} us") for pose in poses]
         boxes = boxes_by_time(entry, request.dynamic_state.actors, times)
         outputs, past = [], dict(session.past)
@@ -216,7 +200,7 @@ class WorldModel(Failures):
         return frame.rgb, sdmap
 
     def _scene_of(self, clip: str) -> str:
-        known = set(self._shelf.ids)
+        known = set(self._scenes.ids)
         for scene_id in (clip, f"clipgt-{clip}"):
             if scene_id in known:
                 return scene_id

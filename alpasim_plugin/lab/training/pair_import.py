@@ -17,7 +17,7 @@ from alpasim_plugin.io.reading import parsing, read_json
 from alpasim_plugin.io.reading.arrays import open_npy
 from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.lab.training.pair_store import Pair, write_sequence
-from alpasim_plugin.log.video_reader import VideoReader
+from alpasim_plugin.log.video import VideoReader
 
 DOING = "importing training pairs"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -57,7 +57,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "kinematic bicycle that follows the plan with preview, within the vehicle's limits",
         ),
         "vdc://": (
-            "alpasim_plugin.alpasim.client.controller:VdcController",
+            "alpasim_plugin.alpasim.client.world_services:VdcController",
             "an AlpaSim controller, and physics: vdc://HOST:PORT[?physics=HOST:PORT&scene=ID]",
         ),
         "perfect": ("alpasim_plugin.control.base:PerfectController", "the ego is exactly where its plan says"),

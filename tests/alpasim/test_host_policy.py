@@ -1,0 +1,288 @@
+"""Callers that mean harm, at every server alike: whatever they leave open, others are served, and what they leave behind ends."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from alpasim_plugin.alpasim.server import gate
+from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
+from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService
+from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
+from alpasim_plugin.alpasim.server.one_policy import _unknown_scene
+from alpasim_plugin.alpasim.server.views import read_lens, read_view
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.log.images import encode_image
+from alpasim_plugin.plugins.interfaces import Policy
+from alpasim_plugin.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
+from alpasim_plugin.wire.services import Stub, methods
+from tests.alpasim.service_cases import START_US, StandInRenderer, channel_to, hosted, pinhole, request
+
+EMPTY = common_pb2.Empty()
+Code = grpc.StatusCode
+SERVICES = ("SensorsimService", "EgodriverService")
+
+
+class Cruise(Policy):
+    """Drives straight on, and remembers how much past it was shown."""
+
+    sensors = (SensorSpec("front"),)
+
+    def __init__(self) -> None:
+        self.poses, self.is_closed = 0, False
+
+    def reset(self, seed: int, route: Route) -> None:
+        pass
+
+    def act(self, observation: Observation) -> Plan:
+        self.poses = len(observation.history)
+        times = observation.t_us + 100_000 * np.arange(41)
+        x = 10e-6 * (times - observation.t_us)
+        return Plan(observation.t_us, times, np.stack([x, 0 * x], axis=1), 0 * x)
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def driver_service(**options: Any) -> tuple[DriverService, list[Cruise]]:
+    made: list[Cruise] = []
+
+    def make(scenario: Any) -> Policy:
+        made.append(Cruise())
+        return made[-1]
+
+    return DriverService("cruise", None, make, _unknown_scene, **options), made
+
+
+@contextmanager
+def served(name: str, workers: int = 2, **options: Any) -> Iterator[Host]:
+    """Run one of our two servers with little to spare."""
+    with ExitStack() as stack:
+        if name == "EgodriverService":
+            service: object = driver_service()[0]
+        else:
+            upstream = stack.enter_context(hosted({name: StandInRenderer()}))
+            made = assemble(Settings(renderer="identity", upstream=Upstream(upstream.address)))
+            stack.callback(made.close)
+            service = made.service
+        yield stack.enter_context(hosted({name: service}, workers=workers, **options))
+
+
+def failure(call: Callable[[], object]) -> tuple[Any, str]:
+    with pytest.raises(grpc.RpcError) as caught:
+        call()
+    return caught.value.code(), caught.value.details()
+
+
+def is_served(host: Host, name: str, **options: Any) -> bool:
+    """Tell whether somebody else, over a connection of their own, gets an answer."""
+    with grpc.insecure_channel(host.address, [("grpc.use_local_subchannel_pool", 1)]) as channel:
+        answer = Stub(channel, name).get_version(EMPTY, timeout=20, **options)
+        status = Stub(channel, "Health").Check(health_pb2.HealthCheckRequest(), timeout=20).status
+    return bool(answer.version_id) and status == health_pb2.HealthCheckResponse.SERVING
+
+
+class Silence:
+    """Messages of a caller that sends none until it is told to end."""
+
+    def __init__(self) -> None:
+        self.over = threading.Event()
+
+    def __iter__(self) -> Iterator[bytes]:
+        self.over.wait(60)
+        yield from ()
+
+
+def watch(channel: Any, silence: Silence) -> Any:
+    call = Stub(channel, "Health").Watch(health_pb2.HealthCheckRequest())
+    next(call)
+    return call
+
+
+def say_nothing(service: str, method: str) -> Callable[[Any, Silence], Any]:
+    return lambda channel, silence: channel.stream_stream(methods(service)[method].path)(iter(silence))
+
+
+def reflect(channel: Any, silence: Silence) -> Any:
+    def questions() -> Iterator[Any]:
+        yield reflection_pb2.ServerReflectionRequest(list_services="*")
+        yield from silence
+
+    call = Stub(channel, "ServerReflection").ServerReflectionInfo(questions())
+    next(call)
+    return call
+
+
+@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("open_call", [watch, reflect], ids=["watch", "reflect"])
+def test_streams_that_stay_open_hold_nobody_up(name: str, open_call: Callable[[Any, Silence], Any]) -> None:
+    silence = Silence()
+    with served(name) as host, channel_to(host) as channel:
+        calls = [open_call(channel, silence) for _ in range(40)]
+        assert is_served(host, name)
+        for call in calls:
+            call.cancel()
+        silence.over.set()
+
+
+@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize(
+    "of", [("Health", "Check"), ("Health", "Watch"), ("ServerReflection", "ServerReflectionInfo"), None], ids=lambda of: of and of[1]
+)
+def test_calls_whose_message_never_comes_hold_nobody_up(name: str, of: tuple[str, str] | None) -> None:
+    silence, open_call = Silence(), say_nothing(*(of or (name, "get_version")))
+    with served(name) as host, channel_to(host) as channel:
+        calls = [open_call(channel, silence) for _ in range(100)]
+        time.sleep(0.5)  # all are there before the next caller
+        assert is_served(host, name)
+        for call in calls:
+            call.cancel()
+        silence.over.set()
+
+
+def test_a_message_may_not_take_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "MESSAGE_S", 0.1)
+    silence = Silence()
+    with served("EgodriverService") as host, channel_to(host) as channel:
+        code, _ = failure(lambda: next(say_nothing("EgodriverService", "drive")(channel, silence)))
+        silence.over.set()
+    assert code is Code.CANCELLED
+
+
+def test_watchers_are_counted_and_a_check_still_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "WATCHERS", 3)
+    with served("EgodriverService") as host, channel_to(host) as channel:
+        calls = [watch(channel, Silence()) for _ in range(3)]
+        assert failure(lambda: watch(channel, Silence()))[0] is Code.RESOURCE_EXHAUSTED
+        assert is_served(host, "EgodriverService")
+        for call in calls:
+            call.cancel()
+        while True:  # their places are free again
+            try:
+                watch(channel, Silence()).cancel()
+                break
+            except grpc.RpcError:
+                time.sleep(0.05)
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_callers_without_the_token_are_refused_without_a_thread_that_works(name: str, tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("secret\n")
+    silence = Silence()
+    with served(name, policy=HostPolicy(token_file=tmp_path / "token")) as host, channel_to(host) as channel:
+        for _ in range(40):
+            assert failure(lambda: next(say_nothing(name, "get_version")(channel, silence)))[0] is Code.UNAUTHENTICATED
+        assert is_served(host, name, metadata=[("authorization", "Bearer secret")])
+        silence.over.set()
+
+
+@pytest.mark.parametrize("listen", ["0.0.0.0:0", "[::]:0"])
+def test_a_server_that_everybody_reaches_says_so_unless_callers_are_checked(
+    listen: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "token").write_text("secret")
+    for near, policy, said in (
+        (listen, HostPolicy(), 1),
+        (listen, HostPolicy(token_file=tmp_path / "token"), 0),
+        ("127.0.0.1:0", HostPolicy(), 0),
+        (f"unix:{tmp_path}/socket", HostPolicy(), 0),
+    ):
+        caplog.clear()
+        Host({"EgodriverService": driver_service()[0]}, near, policy).stop(0.0)
+        assert caplog.text.count("open to everybody who can reach it") == said
+
+
+def test_a_message_that_is_none_is_the_callers_fault() -> None:
+    with served("EgodriverService") as host, channel_to(host) as channel:
+        for path in (methods("EgodriverService")["drive"].path, methods("Health")["Check"].path):
+            assert failure(lambda path=path: channel.unary_unary(path)(b"\xff\xff\xff"))[0] is Code.INVALID_ARGUMENT
+
+
+def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory() -> None:
+    identity = np.eye(4)
+    with pytest.raises(InputError, match="in all"):
+        read_view(request(identity, identity, START_US, size=(8192, 4096)))
+    with pytest.raises(InputError, match="in all"):
+        read_lens(pinhole(8192, 4096), 8192, 4096)
+    assert read_view(request(identity, identity, START_US, size=(3848, 2168))).width == 3848
+
+
+# --- sessions of a driver -------------------------------------------------------------------------------------------------
+
+
+def opening(name: str) -> egodriver_pb2.DriveSessionRequest:
+    request = egodriver_pb2.DriveSessionRequest(session_uuid=name)
+    mount = common_pb2.Pose(quat=common_pb2.Quat(w=1.0))
+    request.rollout_spec.vehicle.available_cameras.add(logical_id="front", intrinsics=pinhole(name="front"), rig_to_camera=mount)
+    return request
+
+
+def seen(name: str, t_us: int) -> egodriver_pb2.RolloutCameraImage:
+    picture = encode_image(np.zeros((32, 48, 3), np.uint8))
+    camera_image = {"logical_id": "front", "frame_end_us": t_us, "image_bytes": picture}
+    return egodriver_pb2.RolloutCameraImage(session_uuid=name, camera_image=camera_image)
+
+
+def moved(name: str, *times_us: int) -> egodriver_pb2.RolloutEgoTrajectory:
+    poses = [{"timestamp_us": t_us, "pose": {"vec": {"x": t_us * 1e-5}, "quat": {"w": 1.0}}} for t_us in times_us]
+    return egodriver_pb2.RolloutEgoTrajectory(session_uuid=name, trajectory={"poses": poses})
+
+
+def test_abandoned_sessions_end_and_give_back_what_they_hold() -> None:
+    now = [0.0]
+    service, made = driver_service(expiry_s=60.0, most_sessions=64, clock=lambda: now[0])
+    with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
+        stub = Stub(channel, "EgodriverService")
+        for i in range(64):
+            stub.start_session(opening(str(i)))
+        stub.submit_image_observation(seen("7", 1))
+        stub.submit_egomotion_observation(moved("7", 1))
+        stub.drive(egodriver_pb2.DriveRequest(session_uuid="7", time_now_us=1))
+        code, text = failure(lambda: stub.start_session(opening("one more")))
+        assert (code, "--expiry-s" in text) == (Code.RESOURCE_EXHAUSTED, True)
+        now[0] = 40.0
+        stub.submit_image_observation(seen("0", 2))  # still in use
+        now[0] = 61.0
+        stub.start_session(opening("one more"))
+        assert len(service.sessions) == 2
+        assert [policy.is_closed for policy in made] == [True]
+        assert "expired" in failure(lambda: stub.submit_image_observation(seen("7", 3)))[1]
+
+
+def test_a_sessions_past_has_an_end_and_so_have_the_times_that_are_kept() -> None:
+    service, made = driver_service()
+    with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
+        stub = Stub(channel, "EgodriverService")
+        stub.start_session(opening("a"))
+        stub.submit_image_observation(seen("a", 1))
+        for block in range(3):
+            stub.submit_egomotion_observation(moved("a", *range(block * MOST_POSES + 1, (block + 1) * MOST_POSES)))
+        stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=3 * MOST_POSES))
+    assert made[0].poses == MOST_POSES
+    assert service.drives_s.maxlen is not None
+
+
+def test_times_that_no_rollout_has_are_the_callers_fault() -> None:
+    service, _ = driver_service()
+    with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
+        stub = Stub(channel, "EgodriverService")
+        stub.start_session(opening("a"))
+        stub.submit_image_observation(seen("a", 1))
+        stub.submit_egomotion_observation(moved("a", 1))
+        for t_us in (2**62, 2**63, 2**64 - 1):
+            for call, request in (
+                (stub.drive, egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=t_us)),
+                (stub.submit_egomotion_observation, moved("a", t_us)),
+                (stub.submit_image_observation, seen("a", t_us)),
+            ):
+                assert failure(lambda call=call, request=request: call(request))[0] is Code.INVALID_ARGUMENT
+        assert stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=2)).trajectory.poses
