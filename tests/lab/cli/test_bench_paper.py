@@ -15,7 +15,7 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench import paper as bench_paper
 from alpasim_plugin.lab.bench import transfer as bench_transfer
 from alpasim_plugin.lab.bench.training_memory import MemoryCell
-from tests.fixers.fixer_cases import small_settings
+from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 
 

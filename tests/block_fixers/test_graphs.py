@@ -14,10 +14,10 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.nets.schedule import steps
+from tests.block_fixers.cache_history import history
+from tests.block_fixers.dit_reference import random_weights
+from tests.block_fixers.eager_recorder import EagerRecorder
 from tests.examples import first_of
-from tests.nets.cache_history import history
-from tests.nets.dit_reference import random_weights
-from tests.nets.eager_recorder import EagerRecorder
 
 SIZES = DiTSizes(width=32, blocks=2, head_width=16, mlp_width=48, adaln_rank=4, text_width=6, context_width=8)
 

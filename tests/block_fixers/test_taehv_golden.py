@@ -12,7 +12,7 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_last, run_layers
 from alpasim_plugin.block_fixers.taehv import TinyDecoder
-from tests.nets.codec_cases import golden
+from tests.block_fixers.codec_cases import golden
 
 TOLERANCE = 2e-5
 CASES = ["latent_n1_t1_4x6", "latent_n1_t3_4x6", "latent_n1_t5_3x5"]

@@ -17,7 +17,7 @@ from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.settings import FixerSettings, WeightsSettings, load_settings
 from alpasim_plugin.plugins.interfaces import BlockRule
 from alpasim_plugin.plugins.parts import names
-from tests.fixers.fixer_cases import small_settings
+from tests.block_fixers.fixer_cases import small_settings
 
 
 def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
@@ -151,7 +151,7 @@ def test_block_rule() -> None:
 
 
 def test_identity_passes_frames_on_and_checks_blocks() -> None:
-    from tests.fixers.fixer_cases import moving_picture
+    from tests.fixers.clip_cases import moving_picture
 
     session = make_fixer("identity", scene_id="scene")
     frames = moving_picture(13)

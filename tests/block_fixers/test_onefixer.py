@@ -15,17 +15,8 @@ from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.plugins.interfaces import Fixer
-from tests.fixers.fixer_cases import (
-    SIZE,
-    busy_settings,
-    fixer,
-    maps_of,
-    moving_picture,
-    pixels,
-    record_videos,
-    run_blocks,
-    small_settings,
-)
+from tests.block_fixers.fixer_cases import busy_settings, fixer, record_videos, run_blocks, small_settings
+from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
 
 FRAMES = moving_picture(29)
 MAPS = maps_of(FRAMES)

@@ -12,10 +12,10 @@ from alpasim_plugin.block_fixers.taehv import TinyDecoder
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.core.errors import InputError
-from tests.nets.codec_cases import SMALL as SMALL_WAN
-from tests.nets.codec_cases import clip as video_clip
-from tests.nets.dit_cases import clip, stream
-from tests.nets.dit_reference import random_weights
+from tests.block_fixers.codec_cases import SMALL as SMALL_WAN
+from tests.block_fixers.codec_cases import clip as video_clip
+from tests.block_fixers.dit_cases import clip, stream
+from tests.block_fixers.dit_reference import random_weights
 
 WIDE = DiTSizes(128, 3, 32, 256, 16, 8, 16, 4, 3)
 

@@ -11,7 +11,8 @@ import torch
 
 from alpasim_plugin.block_fixers import onefixer
 from alpasim_plugin.fixers import guard
-from tests.fixers.fixer_cases import busy_settings, fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import busy_settings, fixer, run_blocks, small_settings
+from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 
 FRAMES = moving_picture(29)
 MAPS = maps_of(FRAMES)

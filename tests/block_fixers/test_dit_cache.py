@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
+from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
 
 
 def pointers(cache):

@@ -14,8 +14,8 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
-from tests.nets.dit_cases import SMALL, clip, furthest
-from tests.nets.dit_reference import random_weights, velocity
+from tests.block_fixers.dit_cases import SMALL, clip, furthest
+from tests.block_fixers.dit_reference import random_weights, velocity
 
 KEYS = sorted(SMALL.shapes())
 SQUARE = {key for key, shape in SMALL.shapes().items() if len(shape) < 2 or shape[0] == shape[1]}

@@ -15,8 +15,8 @@ from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout, causal_conv, causal_conv3d, read_layout
 from alpasim_plugin.core.errors import InputError
+from tests.block_fixers.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 from tests.examples import examples, first_of
-from tests.nets.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from alpasim_plugin.block_fixers.sampling import (
 )
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.schedule import from_names, interpolant, named, shifted, steps
-from tests.nets.cache_history import history
-from tests.nets.dit_cases import clip, furthest, network
+from tests.block_fixers.cache_history import history
+from tests.block_fixers.dit_cases import clip, furthest, network
 
 
 def noise(*shape, seed=0):

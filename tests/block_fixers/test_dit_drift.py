@@ -8,8 +8,8 @@ import torch
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.networks import Precision, at_precision, text_at_precision
 from alpasim_plugin.block_fixers.sizes import DiTSizes
-from tests.nets.dit_cases import clip
-from tests.nets.dit_reference import random_weights, velocity
+from tests.block_fixers.dit_cases import clip
+from tests.block_fixers.dit_reference import random_weights, velocity
 
 TINY = DiTSizes(32, 2, 16, 48, 4, 6, 8, 4, 3)
 SHIPPED = DiTSizes(192, 6, 48, 384, 16, 64, 64)

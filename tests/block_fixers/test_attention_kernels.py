@@ -7,7 +7,7 @@ import torch
 
 from alpasim_plugin.block_fixers.attention import attention_kernel
 from alpasim_plugin.core.errors import InputError
-from tests.nets.dit_cases import clip, furthest, network, stream
+from tests.block_fixers.dit_cases import clip, furthest, network, stream
 
 
 @pytest.mark.parametrize("name", ["auto", "flash", "math"])

@@ -9,9 +9,10 @@ import torch
 
 from alpasim_plugin.block_fixers.graphs import CudaRecorder, GraphedFunction
 from alpasim_plugin.block_fixers.pipeline import BlockPipeline
+from tests.block_fixers.eager_recorder import EagerRecorder
+from tests.block_fixers.fixer_cases import busy_settings, fixer, run_blocks
 from tests.examples import first_of
-from tests.fixers.fixer_cases import busy_settings, fixer, maps_of, moving_picture, run_blocks
-from tests.nets.eager_recorder import EagerRecorder
+from tests.fixers.clip_cases import maps_of, moving_picture
 
 CASES = [(), ("steps=[1000,500]", "window=4", "sink=1"), ("history=finalise",), ("window=1",), ("decoder.kind=latent", "uses_map=false")]
 

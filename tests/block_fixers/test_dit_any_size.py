@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sizes import DiTSizes
+from tests.block_fixers.dit_cases import clip, furthest, stream
+from tests.block_fixers.dit_reference import random_weights, velocity
 from tests.examples import examples
-from tests.nets.dit_cases import clip, furthest, stream
-from tests.nets.dit_reference import random_weights, velocity
 
 HEAD_WIDTHS = (16, 18, 20, 22, 26, 32, 34, 40, 48, 50, 62, 64, 74, 80, 96, 100, 128)  # remainders 0, 2, 4 of 6
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 
 from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
-from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings
 
@@ -20,8 +17,6 @@ SMALL_DIT = (
     "weights.bundle=null", "history=last-forward", "holes=render",
     "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5", "dit.text_width=7", "dit.context_width=9",
 )  # fmt: skip
-SIZE = (32, 48)  # height, width
-STEP_US = 100_000
 
 
 @dataclass(frozen=True)
@@ -55,29 +50,6 @@ def fixer(settings: OneFixerSettings, scene_id: str = "scene", seed: int = 0) ->
     return OneFixer(settings, scene_id, seed)
 
 
-def moving_picture(
-    count: int, size: tuple[int, int] = SIZE, key: str = "picture", holes: bool = True, camera: str = "front"
-) -> list[Frame]:
-    """Return frames of a smooth texture that slides by, with a soft-edged hole in their opacity."""
-    height, width = size
-    texture = stream("tests", 0, key).integers(0, 256, (height + 64, width + 64, 3)).astype(np.float32)
-    texture = cv2.normalize(cv2.GaussianBlur(texture, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    out = []
-    for i in range(count):
-        y, x = (i * 1) % 64, (i * 3) % 64
-        alpha = np.ones(size, np.float32)
-        if holes:
-            alpha[: height // 2, : width // 3] = 0.0
-            alpha[height // 2 :, : width // 6] = 0.5
-        out.append(Frame(i * STEP_US, camera, np.ascontiguousarray(texture[y : y + height, x : x + width]), alpha))
-    return out
-
-
-def maps_of(frames: list[Frame]) -> list[U8]:
-    """Return a map per frame, different from the frame."""
-    return [255 - frame.rgb[::-1].copy() for frame in frames]
-
-
 def run_blocks(fixer: OneFixer, frames: list[Frame], maps: list[U8]) -> list[Frame]:
     """Step through a clip of one camera in whole blocks; the last may be short."""
     out: list[Frame] = []
@@ -87,10 +59,6 @@ def run_blocks(fixer: OneFixer, frames: list[Frame], maps: list[U8]) -> list[Fra
         out += fixer.step(frames[cut], maps[cut])
         block += 1
     return out
-
-
-def pixels(frames: list[Frame]) -> U8:
-    return np.stack([frame.rgb for frame in frames])
 
 
 def record_videos(fixer: OneFixer) -> list[torch.Tensor]:

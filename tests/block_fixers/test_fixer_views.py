@@ -10,7 +10,7 @@ import torch
 from alpasim_plugin.block_fixers.clips import to_clip, to_images
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers.views import group_views
-from tests.fixers.fixer_cases import maps_of, moving_picture
+from tests.fixers.clip_cases import maps_of, moving_picture
 
 
 def test_every_grey_level_survives_the_way_to_tensors_and_back() -> None:

@@ -6,7 +6,7 @@ import torch
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sizes import DiTSizes
-from tests.nets.dit_reference import random_weights
+from tests.block_fixers.dit_reference import random_weights
 
 SMALL = DiTSizes(
     width=24, blocks=2, head_width=12, mlp_width=40, adaln_rank=5, text_width=7, context_width=9, latent_channels=4, map_channels=3

@@ -10,8 +10,8 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.layers import Float32Linear
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.errors import InputError
-from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
-from tests.nets.dit_reference import random_weights, rope_angles, velocity
+from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
+from tests.block_fixers.dit_reference import random_weights, rope_angles, velocity
 
 WIDE = DiTSizes(
     width=128, blocks=3, head_width=32, mlp_width=256, adaln_rank=16, text_width=8, context_width=16, latent_channels=4, map_channels=3

@@ -11,8 +11,8 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.layers import embed_latents, patchify, sinusoid
 from alpasim_plugin.block_fixers.sampling import context_level, sample_block
 from alpasim_plugin.nets.schedule import from_names
-from tests.nets.cache_history import history
-from tests.nets.dit_cases import furthest, stream
+from tests.block_fixers.cache_history import history
+from tests.block_fixers.dit_cases import furthest, stream
 
 EPSILON = torch.finfo(torch.float32).eps
 TOLERANCE = 1e-5  # ten times tighter than asked; the original itself moves by 4e-6 with another arithmetic

@@ -20,7 +20,8 @@ from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings
-from tests.fixers.fixer_cases import SIZE, STEP_US, busy_settings, fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import busy_settings, fixer, run_blocks, small_settings
+from tests.fixers.clip_cases import SIZE, STEP_US, maps_of, moving_picture, pixels
 
 TINY = (16, 32)  # height, width, for long rollouts
 

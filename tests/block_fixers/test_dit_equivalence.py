@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.block_fixers.attention import block_causal_attention
 from alpasim_plugin.block_fixers.sizes import DiTSizes
+from tests.block_fixers.attention_reference import block_causal_reference
+from tests.block_fixers.cache_history import history
+from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
+from tests.block_fixers.dit_reference import latent_mask, random_weights, velocity
 from tests.examples import examples
-from tests.nets.attention_reference import block_causal_reference
-from tests.nets.cache_history import history
-from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
-from tests.nets.dit_reference import latent_mask, random_weights, velocity
 
 SIZES = [
     SMALL,

@@ -17,7 +17,8 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle, save_bundle
 from alpasim_plugin.nets.headers import read_metadata
-from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
+from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 
 FRAMES = moving_picture(13)
 MAPS = maps_of(FRAMES)

@@ -12,7 +12,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_first, channels_last
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
-from tests.nets.codec_cases import golden
+from tests.block_fixers.codec_cases import golden
 
 TOLERANCE = 3e-5  # a third of what is promised; the original itself moves by 4e-6 between machines
 CLIPS = ["clip_b1_t1_32x48", "clip_b1_t9_32x48", "clip_b1_t17_40x64"]
