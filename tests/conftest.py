@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.durations import pytest_addoption, pytest_runtest_logreport, pytest_terminal_summary  # noqa: F401 - hooks
 from tests.examples import PROFILE, examples
 from tests.report.browser import Browser, find_chromium
 

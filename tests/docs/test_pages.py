@@ -93,7 +93,7 @@ def reachable(docs: Path) -> set[Path]:
     seen, queue = {docs / "index.md"}, [docs / "index.md"]
     while queue:
         for file, _ in local_links(queue.pop()):
-            if file.suffix == ".md" and docs in file.parents and file not in seen:
+            if file.suffix == ".md" and file.is_file() and docs in file.parents and file not in seen:
                 seen.add(file)
                 queue.append(file)
     return seen
