@@ -1,6 +1,6 @@
 """How long each file of tests takes: ``pytest --durations-file FILE`` writes it and says what became slower than `tests/durations.json`.
 
-Nothing fails for it. ``pytest ... --durations-file tests/durations.json`` keeps a new standard, which holds for one machine and one number of
+Nothing fails for it. ``pytest --durations-file tests/durations.json`` keeps a new standard, which holds for one machine and one number of
 workers: CI's.
 """
 
