@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 # groups of kernels come first, one a worker, so that no two processes compile the same ones; then what takes longest, so that no worker is
 # left alone with it at the end.
 FIRST = ("gaussians/test_rasterize_hard_cases.py", "semantic_map/test_draw.py", "gaussians/test_rasterize_gradient.py")
-LONG = ("parts", "runtime", "gaussians", "cli", "renderers", "training", "fixers")
+LONG = ("plugins", "alpasim", "runtime", "gaussians", "training", "cli", "renderers", "fixers", "bench")
 
 
 def order_of(item: pytest.Item) -> int:
