@@ -31,6 +31,8 @@ REPO = Path(__file__).resolve().parents[1]
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep what tests fit out of the user's cache; workers inherit the folder."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False  # files are handed out in the order below, not those of most tests first
     if "SIMRUN_CACHE" not in os.environ:
         folder = tempfile.mkdtemp(prefix="simrun-tests-")
         os.environ["SIMRUN_CACHE"] = folder
