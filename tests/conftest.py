@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.durations import pytest_addoption, pytest_runtest_logreport, pytest_terminal_summary  # noqa: F401 - hooks
 from tests.examples import PROFILE, examples
 from tests.report.browser import Browser, find_chromium
 
@@ -30,6 +31,8 @@ REPO = Path(__file__).resolve().parents[1]
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep what tests fit out of the user's cache; workers inherit the folder."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False  # files are handed out in the order below, not those of most tests first
     if "SIMRUN_CACHE" not in os.environ:
         folder = tempfile.mkdtemp(prefix="simrun-tests-")
         os.environ["SIMRUN_CACHE"] = folder
@@ -40,7 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
 # groups of kernels come first, one a worker, so that no two processes compile the same ones; then what takes longest, so that no worker is
 # left alone with it at the end.
 FIRST = ("gaussians/test_rasterize_hard_cases.py", "semantic_map/test_draw.py", "gaussians/test_rasterize_gradient.py")
-LONG = ("parts", "runtime", "gaussians", "cli", "renderers", "training", "fixers")
+LONG = ("plugins", "alpasim", "runtime", "gaussians", "training", "cli", "renderers", "fixers", "bench")
 
 
 def order_of(item: pytest.Item) -> int:

@@ -30,7 +30,8 @@ TESTS = (
     "tests/log",
 )
 TORCH = os.environ.get("SIMRUN_TORCH", "torch==2.8.*")
-WITH_NETWORKS = ("tests/alpasim/test_sensorsim_service.py", "tests/alpasim/test_world_model.py", "tests/nets", "tests/fixers")
+WITH_NETWORKS = ("tests/alpasim/test_sensorsim_service.py", "tests/alpasim/test_world_model.py", "tests/nets", "tests/fixers",
+                 "tests/block_fixers")  # fmt: skip
 
 
 @pytest.mark.slow

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+LAB = "docs/lab"
+LAB_VERBS = ("bench", "judge", "train")
 SHELL = ("bash", "sh", "console", "")
 SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
@@ -51,6 +54,11 @@ class Command:
         return f"{self.page}: {' '.join(self.words)}"
 
     @property
+    def is_of_lab(self) -> bool:
+        """Tell whether it is a verb of the laboratory's."""
+        return bool(self.words) and self.words[0] in LAB_VERBS
+
+    @property
     def why_not_run(self) -> str:
         """Say why it is only parsed; empty if it is run."""
         line = " ".join(self.words)
@@ -58,8 +66,18 @@ class Command:
 
 
 def pages(repo: Path) -> list[Path]:
-    """Return README and every page of docs/."""
-    return [repo / "README.md", *sorted((repo / "docs").rglob("*.md"))]
+    """Return README and every page of docs/ but the laboratory's, which are not there where it is not (`tests/lab/docs`)."""
+    return [repo / "README.md", *(page for page in sorted((repo / "docs").rglob("*.md")) if not is_of_lab(repo, page))]
+
+
+def lab_pages(repo: Path) -> list[Path]:
+    """Return the laboratory's pages; none where it is not."""
+    return sorted((repo / LAB).rglob("*.md"))
+
+
+def is_of_lab(repo: Path, path: Path) -> bool:
+    """Tell whether a file is one of the laboratory's pages or pictures."""
+    return path.is_relative_to(repo / LAB)
 
 
 def lines_of(page: Path) -> list[str]:
@@ -70,10 +88,10 @@ def lines_of(page: Path) -> list[str]:
     return [line.strip() for body in blocks for line in body.replace("\\\n", " ").splitlines()] + steps
 
 
-def commands(repo: Path) -> list[Command]:
-    """Return every ``simrun`` command of the pages, in their order."""
+def commands(repo: Path, of: Sequence[Path]) -> list[Command]:
+    """Return every ``simrun`` command of some pages, in their order."""
     found = []
-    for page in pages(repo):
+    for page in of:
         for line in lines_of(page):
             match = SIMRUN.match(line)
             if match:

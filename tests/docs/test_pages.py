@@ -1,4 +1,7 @@
-"""The pages of docs/: links resolve, pages are short, and every page is reachable from the index."""
+"""The pages of docs/: links resolve, pages are short, and every page is reachable from the index.
+
+The laboratory's pages, and what leads to them, are those of `tests/lab/docs`.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.docs import commands
+
 MAX_LINES = 200
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios")
-RECORDS = "experiments"  # records of experiments may be longer
+RECORDS = "experiments"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 MENTION = re.compile(r"\bdocs/[\w./-]+\.(?:md|png|jpg|py)\b")
+OF_LAB = re.compile(r"\blab[/.]")  # files and modules of the laboratory
 HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.M)
 
 
@@ -41,17 +47,24 @@ def local_links(page: Path) -> list[tuple[Path, str]]:
 
 @pytest.fixture
 def pages(repo: Path) -> list[Path]:
-    """Return README, CHANGELOG and every page of docs/."""
-    return [repo / "README.md", repo / "CHANGELOG.md", *sorted((repo / "docs").rglob("*.md"))]
+    """Return README, CHANGELOG and every page of docs/ but the laboratory's."""
+    return [repo / "CHANGELOG.md", *commands.pages(repo)]
 
 
-def test_links_resolve(repo: Path, pages: list[Path]) -> None:
+def broken_links(repo: Path, pages: list[Path], to_lab: bool) -> list[str]:
+    """Return the links that lead nowhere, of those that lead to the laboratory's pages or of the others."""
     broken = []
     for page in pages:
         for file, anchor in local_links(page):
+            if commands.is_of_lab(repo, file) != to_lab:
+                continue
             if not file.exists() or (anchor and anchor not in anchors(file)):
                 broken.append(f"{page.relative_to(repo)}: {file.name}{'#' if anchor else ''}{anchor}")
-    assert broken == []
+    return broken
+
+
+def test_links_resolve(repo: Path, pages: list[Path]) -> None:
+    assert broken_links(repo, pages, to_lab=False) == []
 
 
 def test_pages_of_the_docs_that_code_and_pages_name_exist(repo: Path, pages: list[Path]) -> None:
@@ -60,45 +73,64 @@ def test_pages_of_the_docs_that_code_and_pages_name_exist(repo: Path, pages: lis
     missing = []
     for file in [*code, *pages]:
         mentions = MENTION.findall(file.read_text(encoding="utf-8"))
-        missing += [f"{file.relative_to(repo)}: {mention}" for mention in mentions if not (repo / mention).is_file()]
+        there = (mention for mention in mentions if not mention.startswith(commands.LAB))
+        missing += [f"{file.relative_to(repo)}: {mention}" for mention in there if not (repo / mention).is_file()]
     assert missing == []
 
 
-def test_pages_are_short(repo: Path, pages: list[Path]) -> None:
+def too_long(repo: Path, pages: list[Path]) -> dict[str, int]:
+    """Return the pages of too many lines; records of experiments may be longer."""
     lengths = {str(page.relative_to(repo)): len(page.read_text(encoding="utf-8").splitlines()) for page in pages}
-    too_long = {page: length for page, length in lengths.items() if length > MAX_LINES and not page.startswith(f"docs/{RECORDS}/")}
-    assert too_long == {}
+    return {page: length for page, length in lengths.items() if length > MAX_LINES and not page.startswith(f"docs/{RECORDS}/")}
 
 
-def test_every_page_is_reachable_from_the_index(repo: Path) -> None:
-    docs = repo / "docs"
+def test_pages_are_short(repo: Path, pages: list[Path]) -> None:
+    assert too_long(repo, pages) == {}
+
+
+def reachable(docs: Path) -> set[Path]:
+    """Return the pages that the index leads to."""
     seen, queue = {docs / "index.md"}, [docs / "index.md"]
     while queue:
         for file, _ in local_links(queue.pop()):
-            if file.suffix == ".md" and docs in file.parents and file not in seen:
+            if file.suffix == ".md" and file.is_file() and docs in file.parents and file not in seen:
                 seen.add(file)
                 queue.append(file)
-    assert {str(page.relative_to(docs)) for page in docs.rglob("*.md")} == {str(page.relative_to(docs)) for page in seen}
+    return seen
+
+
+def test_every_page_is_reachable_from_the_index(repo: Path) -> None:
+    assert [page.name for page in sorted({*commands.pages(repo)[1:]} - reachable(repo / "docs"))] == []
+
+
+def unshown(folder: Path, pages: list[Path]) -> list[str]:
+    """Return the pictures of a folder that no page shows."""
+    shown = {file for page in pages for file, _ in local_links(page)}
+    return [path.name for path in folder.rglob("*") if path.suffix in (".png", ".jpg") and path.resolve() not in shown]
 
 
 def test_every_picture_is_shown(repo: Path, pages: list[Path]) -> None:
-    shown = {file for page in pages for file, _ in local_links(page)}
-    pictures = [path for path in (repo / "docs").rglob("*") if path.suffix in (".png", ".jpg")]
-    assert [path.name for path in pictures if path.resolve() not in shown] == []
+    assert unshown(repo / "docs" / "img", pages) == []
 
 
-def test_files_that_pages_name_exist(repo: Path, pages: list[Path]) -> None:
-    roots = (repo, repo / "alpasim_plugin", repo / "alpasim_plugin" / "gaussians", repo / "docs")
+def files_not_there(repo: Path, pages: list[Path]) -> list[str]:
+    """Return the source files that pages name and that do not exist."""
+    roots = (repo, repo / "alpasim_plugin", repo / "alpasim_plugin" / "gaussians", repo / "alpasim_plugin" / "lab", repo / "docs")
     named = re.compile(r"\b([a-z][\w]*(?:/\w+)+\.(?:py|proto))\b")
     missing = []
     for page in pages:
         code = re.findall(r"`([^`\n]+)`", without_code(page.read_text(encoding="utf-8")))
         files = {file for text in code for file in named.findall(text)}
         missing += [f"{page.relative_to(repo)}: {file}" for file in sorted(files) if not any((root / file).is_file() for root in roots)]
-    assert missing == []
+    return missing
 
 
-def test_python_examples_parse_and_import_what_exists(repo: Path, pages: list[Path]) -> None:
+def test_files_that_pages_name_exist(repo: Path, pages: list[Path]) -> None:
+    assert [line for line in files_not_there(repo, pages) if not OF_LAB.search(line)] == []
+
+
+def imports_of_nothing(repo: Path, pages: list[Path]) -> list[str]:
+    """Return the names that examples in Python import and that do not exist; an example that does not parse raises."""
     missing = []
     for page in pages:
         for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M):
@@ -108,4 +140,8 @@ def test_python_examples_parse_and_import_what_exists(repo: Path, pages: list[Pa
                     file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
                     text = file.read_text(encoding="utf-8") if file.is_file() else ""
                     missing += [f"{page.name}: {node.module}.{a.name}" for a in node.names if not re.search(rf"\b{a.name}\b", text)]
-    assert missing == []
+    return missing
+
+
+def test_python_examples_parse_and_import_what_exists(repo: Path, pages: list[Path]) -> None:
+    assert [line for line in imports_of_nothing(repo, pages) if not OF_LAB.search(line)] == []

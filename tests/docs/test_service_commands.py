@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.commands import SHORT, Command, commands
+from tests.docs.commands import SHORT, Command, commands, pages
 
 REPO = Path(__file__).resolve().parents[2]
 PAGES = ("docs/alpasim.md", "docs/alpasim-drivers.md", "docs/can.md")
@@ -30,7 +30,7 @@ BESIDE = {  # address in a command -> what answers there
     "127.0.0.1:6000": ("serve-policy", "lane-camera", "--scenes", "scenes", "--scenes", "smoke/curve", "--listen", "127.0.0.1:6000"),
 }
 CONTROL_UNIT = ("can://udp_multicast:239.74.163.2", "alpasim_plugin.control.can_ecu", "udp_multicast:239.74.163.2")
-COMMANDS = [one for one in commands(REPO) if one.page in PAGES and not re.search(ELSEWHERE, " ".join(one.words))]
+COMMANDS = [one for one in commands(REPO, pages(REPO)) if one.page in PAGES and not re.search(ELSEWHERE, " ".join(one.words))]
 
 
 @contextmanager

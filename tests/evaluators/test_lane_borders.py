@@ -7,12 +7,11 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.types import Lane
-from alpasim_plugin.lab.bench.evaluators import busy_road
 from evaluators import PRESETS
 from evaluators.metrics.border import box_to_segments
 from evaluators.metrics.footprint import Footprints, ego_footprints, origin_of
 from evaluators.metrics.offroad import containment
-from evaluators.metrics.reference import road_by_step
+from evaluators.metrics.reference import busy_road, road_by_step
 from evaluators.metrics.road import Road
 from tests.evaluators.eval_build import lane, road_map, rollout, scene, track
 from tests.examples import examples

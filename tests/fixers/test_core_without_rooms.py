@@ -56,16 +56,8 @@ def alone(*code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_every_core_module_of_fixers_networks_and_renderers_imports_without_the_rooms() -> None:
-    alone(IMPORT_ALL)
-
-
-def test_onefixer_repairs_a_frame_without_the_rooms() -> None:
-    alone(REPAIR)
-
-
-def test_a_network_whose_package_is_absent_is_named_in_the_error() -> None:
-    alone(ABSENT)
+def test_without_the_rooms_core_modules_import_onefixer_repairs_and_an_absent_network_is_named_in_the_error() -> None:
+    alone(IMPORT_ALL, REPAIR, ABSENT)  # in one process: most of the time goes by while torch is imported
 
 
 @pytest.mark.parametrize("name", ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"])

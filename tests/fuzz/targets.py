@@ -1,4 +1,7 @@
-"""What is fuzzed: every reader, with small valid files to damage and a use for what is accepted."""
+"""What is fuzzed: every reader, with small valid files to damage and a use for what is accepted.
+
+The laboratory's readers (`tests.lab.fuzz_targets`) are among them where it is installed.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,16 @@ import random
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import lru_cache
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from alpasim_plugin.core.errors import SimrunError
 from tests.fuzz.mutate import mutate
 from tests.fuzz.uses import (
     Refused,
+    Target,
     command,
     drive,
     one_of,
@@ -25,10 +29,7 @@ from tests.fuzz.uses import (
     use_bundle,
     use_gaussians,
     use_log,
-    use_pairs,
     use_picture,
-    use_poses,
-    use_training_run,
     use_video,
     use_views,
     use_weights,
@@ -45,12 +46,9 @@ from tests.fuzz.valid_files import (
     make_cosmos,
     make_file,
     make_log,
-    make_pairs,
-    make_poses,
     make_run,
     make_scene_file,
     make_torch_weights,
-    make_training_run,
     make_usdz,
     make_video,
     make_views,
@@ -60,16 +58,6 @@ from tests.fuzz.valid_files import (
 
 FORMS = {".json": "json", ".jsonl": "text", ".yaml": "yaml", ".xml": "xml", ".xodr": "xml"}
 Files = dict[str, bytes]
-
-
-@dataclass(frozen=True)
-class Target:
-    """A reader: how valid files are made, and what is done with a folder of damaged ones."""
-
-    name: str
-    make: Callable[[Path], None]  # writes valid files into an empty folder
-    use: Callable[[Path], None]  # reads the folder; raises what the reader raises
-    damage: Sequence[str] = ("*",)  # patterns of the files to damage
 
 
 def inputs(target: Target, rng: random.Random) -> Files:
@@ -150,7 +138,7 @@ def _inside_zip(data: bytes, rng: random.Random) -> bytes:
 
 
 REPORT = ("run.json", "summary.json", "rollouts.parquet", "steps.parquet", "scenes/*.json", "manifest.json", "*.jsonl", "*.asl")
-TARGETS: tuple[Target, ...] = (
+CORE: tuple[Target, ...] = (
     Target("scenario", make_scene_file("smoke/lead_car.yaml"), one_of("*.yaml", drive)),
     Target("scenario, rich", make_file("scene.yaml", RICH.encode), one_of("*.yaml", drive)),
     Target("scenario, crossing", make_scene_file("hard/crossing_pedestrian.yaml"), one_of("*.yaml", drive)),
@@ -175,14 +163,23 @@ TARGETS: tuple[Target, ...] = (
            ("gate.yaml", "baseline.json")),
     Target("run folder, check", make_run, command("check", "@/run"), REPORT),
     Target("torch weights", make_torch_weights, one_of("*.pt", use_weights)),
-    Target("training run", make_training_run, use_training_run),
     Target("video", make_video, one_of("*.mp4", use_video)),
-    Target("pairs", make_pairs, use_pairs),
-    Target("poses", make_poses, one_of("*.json", use_poses)),
     Target("posed views", make_views, use_views),
     Target("PNG", make_file("a.png", lambda: picture_bytes(".png")), one_of("*.png", use_picture)),
     Target("JPEG", make_file("a.jpg", lambda: picture_bytes(".jpg")), one_of("*.jpg", use_picture)),
 )  # fmt: skip
+
+
+def of_the_laboratory() -> tuple[Target, ...]:
+    """Return the laboratory's readers; none where it is not installed."""
+    if not entry_points(group="simrun.commands", name="train"):
+        return ()
+    from tests.lab.fuzz_targets import TARGETS
+
+    return TARGETS
+
+
+TARGETS = (*CORE, *of_the_laboratory())
 
 
 @contextlib.contextmanager

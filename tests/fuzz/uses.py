@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.io.checksum_files import vouch_for
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader: how valid files are made, and what is done with a folder of damaged ones."""
+
+    name: str
+    make: Callable[[Path], None]  # writes valid files into an empty folder
+    use: Callable[[Path], None]  # reads the folder; raises what the reader raises
+    damage: Sequence[str] = ("*",)  # patterns of the files to damage
 
 
 class Refused(Exception):
@@ -108,21 +118,6 @@ def use_weights(path: Path) -> None:
     load_weights(path)
 
 
-def toy_training(folder: Path) -> Any:
-    """Return a trainer of one small layer, four updates long, that continues what the folder holds."""
-    import torch
-
-    from alpasim_plugin.lab.training.trainer import Schedule, Trainer
-
-    torch.manual_seed(0)
-    net = torch.nn.Linear(2, 2)
-    return Trainer(net, folder, Schedule(4, 1e-3, 0), lambda i: torch.ones(1, 2) * i, lambda x, i: (net(x).square().mean(), {}), {"toy": 1})
-
-
-def use_training_run(folder: Path) -> None:
-    assert toy_training(folder / "run").step >= 0
-
-
 def use_video(path: Path) -> None:
     from alpasim_plugin.log.video import VideoReader
 
@@ -134,20 +129,6 @@ def use_picture(path: Path) -> None:
     from alpasim_plugin.log import decode_image
 
     assert decode_image(path.read_bytes()).ndim == 3
-
-
-def use_pairs(folder: Path) -> None:
-    from alpasim_plugin.lab.training.pair_store import PairDataset
-
-    for sequence in PairDataset(folder, "train").sequences:
-        clip = sequence.clip
-        assert len(np.asarray(clip.t_us)) == len(clip) > 0
-
-
-def use_poses(path: Path) -> None:
-    from alpasim_plugin.lab.training.pair_import import read_poses
-
-    read_poses(path, 10.0)
 
 
 def use_views(folder: Path) -> None:

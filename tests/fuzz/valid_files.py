@@ -144,12 +144,6 @@ def make_torch_weights(folder: Path) -> None:
     torch.save({"state_dict": {"net.a": torch.zeros(2, 3), "net.b": torch.ones(4)}}, folder / "a.pt")
 
 
-def make_training_run(folder: Path) -> None:
-    from tests.fuzz.uses import toy_training
-
-    toy_training(folder / "run").run(until=2)
-
-
 def make_video(folder: Path) -> None:
     from alpasim_plugin.log.video import write_mp4
 
@@ -169,17 +163,6 @@ def make_baseline(folder: Path) -> None:
     make_run(folder)
     write_baseline(read_run(folder / "run"), folder / "baseline.json")
     shutil.copy(REPO / "configs" / "gates" / "default.yaml", folder / "gate.yaml")
-
-
-def make_pairs(folder: Path) -> None:
-    from tests.lab.training.pair_files import make
-
-    make(folder, frames=2, height=8, width=8)
-
-
-def make_poses(folder: Path) -> None:
-    rows = [{"T_world_camera": np.eye(4).tolist(), "t_us": 100_000 * i} for i in range(3)]
-    (folder / "poses.json").write_text(json.dumps(rows))
 
 
 def make_views(folder: Path) -> None:

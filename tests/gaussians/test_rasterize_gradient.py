@@ -11,8 +11,8 @@ from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_reference import composite_reference, project_gaussians, rasterize_reference
+from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.lab.bench.raster import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import (
     FIELDS,

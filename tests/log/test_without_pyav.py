@@ -9,7 +9,7 @@ from pathlib import Path
 CODE = """
 import sys
 sys.modules["av"] = None
-import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runtime.refine, alpasim_plugin.lab.training.pair_import
+import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runtime.refine
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.log.video import VideoReader
 try:

@@ -36,11 +36,13 @@ def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
 def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(scenario: Scenario) -> None:
     names = [name for name in known("renderer") if name.startswith("broken-")]
     assert len(names) == 6
+    views = requests(scenario, LATE_FRAMES + 2)
+    good = make_renderer("clean", scenario).render(views[-1])
     for name in names:
-        clean, broken = make_renderer("clean", scenario), make_renderer(name, scenario)
+        broken = make_renderer(name, scenario)
         assert isinstance(broken, Renderer)
-        for r in requests(scenario, LATE_FRAMES + 2):
-            good, bad = clean.render(r), broken.render(r)
+        for r in views:
+            bad = broken.render(r)
         assert bad.t_us == good.t_us
         assert bad.rgb.shape == good.rgb.shape
         assert bad.rgb.dtype == np.uint8

@@ -19,7 +19,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.lab.bench.executors import bench_executor, local_nodes
 from evaluators.statistics.sequential.question import read_decision
 from tests.runtime.cluster_nodes import Nodes
 from tests.runtime.grey_policy import BY_GREY
@@ -147,10 +146,3 @@ def test_ctrl_c_leaves_no_worker_and_the_same_command_goes_on(
     assert 1 <= done < 16
     assert run_command(words) == 0
     assert len(rows(tmp_path / "run")) == 16
-
-
-def test_sixteen_workers_on_four_nodes_are_used_for_nine_tenths_of_the_time() -> None:
-    with local_nodes(4, 4) as made:
-        (row,) = bench_executor(made, [16], rollouts=5, seconds=4.0)
-    assert row.rollouts == 80
-    assert 0.9 <= row.efficiency <= 1.0

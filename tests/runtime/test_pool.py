@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.executors.assignment import differences, identity_of, targets_of
 from alpasim_plugin.runtime.executors.base import Died, Done, Event, Faulty, Lost, Place, Rules
@@ -207,19 +206,6 @@ def test_the_text_of_the_option_is_understood() -> None:
 def test_an_executor_that_is_not_there_is_refused(text: str, cores: int | None) -> None:
     with pytest.raises(InputError, match="choosing an executor"):
         parse_executor(text, cores=cores)
-
-
-@pytest.mark.parametrize(
-    ("more", "found"),
-    [
-        (["--workers", "1,32"], "4 nodes of 4 cores hold 16"),
-        (["--workers", "1,none"], "no numbers from 1 up"),
-        (["--executor", "slurm"], "cannot be started before the clock"),
-    ],
-)
-def test_an_executor_that_cannot_be_measured_is_refused(more: list[str], found: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["bench", "executors", *more]) == 2
-    assert found in capsys.readouterr().err
 
 
 def test_a_node_is_compared_by_name() -> None:

@@ -21,12 +21,14 @@ from typing import Any, Literal, get_args
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.gaussians.raster import rasterize_cpu
 from alpasim_plugin.gaussians.raster.prepared import prepare
+from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
 from alpasim_plugin.lab.bench.aggregation import write_random_table
-from alpasim_plugin.lab.bench.evaluators import PAPER, busy_road
-from alpasim_plugin.lab.bench.raster import SKY, driving_camera, driving_like_scene
+from alpasim_plugin.lab.bench.evaluators import PAPER
+from alpasim_plugin.lab.bench.raster import SKY
 from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.runtime.cell import run_cell
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
+from evaluators.metrics.reference import busy_road
 from evaluators.metrics.score import score
 from evaluators.statistics.summary import numbers
 from scenarios.suite import expand

@@ -16,7 +16,8 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
-from alpasim_plugin.lab.bench.raster import SKY, driving_camera, driving_like_scene
+from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
+from alpasim_plugin.lab.bench.raster import SKY
 
 Size = tuple[int, int, int]  # Gaussians, width, height
 SIZES: tuple[Size, ...] = ((10_000, 256, 144), (30_000, 256, 144), (100_000, 480, 272))

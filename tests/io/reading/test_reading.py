@@ -26,11 +26,11 @@ from alpasim_plugin.io.reading.images import decode_image, image_size
 from alpasim_plugin.io.reading.packed import check_names, gunzip, unzstd
 from alpasim_plugin.io.reading.tables import read_parquet
 from tests.fuzz.seen import png_header
-from tests.fuzz.targets import TARGETS, check, inputs, workplace
+from tests.fuzz.targets import CORE, check, inputs, workplace
 
 DOING = "testing"
 SLICE = int(os.environ.get("SIMRUN_FUZZ", "1"))  # inputs of each reader
-QUICK = ("scenario", "CommonRoad", "PLY", "SPZ", "poses", "PNG")  # CI runs all readers for a minute: python -m tests.fuzz --seconds 60
+QUICK = ("scenario", "CommonRoad", "PLY", "SPZ", "PNG")  # CI runs all readers for a minute: python -m tests.fuzz --seconds 60
 
 
 def refused(call: Callable[[], object]) -> str:
@@ -162,7 +162,7 @@ def test_xml_has_limits_and_no_entities(text: str) -> None:
     refused(lambda: parse_xml(text.encode(), "a.xml", DOING))
 
 
-@pytest.mark.parametrize("target", [pytest.param(t, id=t.name, marks=[] if t.name in QUICK else [pytest.mark.slow]) for t in TARGETS])
+@pytest.mark.parametrize("target", [pytest.param(t, id=t.name, marks=[] if t.name in QUICK else [pytest.mark.slow]) for t in CORE])
 def test_damaged_files_are_refused_or_usable(target) -> None:
     with workplace() as folder:
         for number in range(SLICE):

@@ -18,7 +18,7 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench.appearance import AppearanceRun, measure_appearance
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.training.pair_store import PairSequence
-from tests.fixers.fixer_cases import small_settings
+from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.corner import make_corner
 
 

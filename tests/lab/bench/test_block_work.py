@@ -17,8 +17,8 @@ from alpasim_plugin.lab.bench.op_counter import OpCounter
 from alpasim_plugin.lab.bench.random_networks import random_networks
 from alpasim_plugin.lab.bench.roofline import DEVICES, block_work, device_of, networks_bytes, run_block
 from alpasim_plugin.lab.cli.bench import app
+from tests.block_fixers.fixer_cases import SMALL_DIT, small_settings
 from tests.examples import first_of
-from tests.fixers.fixer_cases import SMALL_DIT, small_settings
 from tests.lab.bench.dit_work import cache_bytes, forward_work
 
 LAPTOP = "1:0.1:20:8"

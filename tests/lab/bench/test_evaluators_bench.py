@@ -8,9 +8,10 @@ import pytest
 
 from alpasim_plugin.lab.bench import evaluators as bench
 from alpasim_plugin.lab.bench.aggregation import bench_table, compared, write_random_table
-from alpasim_plugin.lab.bench.evaluators import bench_evaluators, busy_road, contacts_per_step
+from alpasim_plugin.lab.bench.evaluators import bench_evaluators, contacts_per_step
 from evaluators import aggregate
 from evaluators.metrics.presets import PRESETS
+from evaluators.metrics.reference import busy_road
 
 
 def test_all_three_ways_agree_on_a_small_world_with_contacts_and_departures():

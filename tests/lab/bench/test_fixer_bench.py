@@ -13,8 +13,8 @@ from alpasim_plugin.fixers import guard
 from alpasim_plugin.lab.bench import fixer as bench
 from alpasim_plugin.lab.bench.fixer import BenchOptions, Row, bench_clip, cases, difference
 from alpasim_plugin.lab.bench.fixer_table import HEAD, markdown, plot, put_between_marks
-from tests.fixers.fixer_cases import SMALL_DIT, small_settings
-from tests.fixers.small_clip import driving_clip
+from tests.block_fixers.fixer_cases import SMALL_DIT, small_settings
+from tests.lab.bench.small_clip import driving_clip
 
 FRAMES = 29  # 8 latents: more than windows of 4 and 6
 SIZE = (48, 32)

@@ -12,7 +12,7 @@ from alpasim_plugin.block_fixers.whole_clip import whole_clip
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.bench.fixer_drive import DriveSample, drive
-from tests.fixers.fixer_cases import SMALL_DIT, small_settings
+from tests.block_fixers.fixer_cases import SMALL_DIT, small_settings
 
 SCENE = "smoke/straight"
 SIZE = (64, 48)

@@ -14,8 +14,8 @@ from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.lab.bench.fixer_speed import measure
 from alpasim_plugin.nets.checkpoints import load_weights
-from tests.fixers.fixer_cases import small_settings as settings
-from tests.fixers.small_clip import driving_clip
+from tests.block_fixers.fixer_cases import small_settings as settings
+from tests.lab.bench.small_clip import driving_clip
 
 
 @pytest.fixture(scope="module")

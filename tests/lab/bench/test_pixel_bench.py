@@ -5,7 +5,7 @@ from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench.fixer_rows import BenchOptions, Row
 from alpasim_plugin.lab.bench.fixer_table import cells, markdown
 from alpasim_plugin.lab.bench.pixel_fixer import CASES, bench_clip
-from tests.fixers.small_clip import driving_clip
+from tests.lab.bench.small_clip import driving_clip
 
 SMALL = ("weights.bundle=null", "holes=noise", "generator.widths=[8,8,8]", "untrained=random")
 

@@ -12,7 +12,8 @@ import pytest
 
 from alpasim_plugin.gaussians import rasterize
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.lab.bench.raster import bench_raster, driving_camera, driving_like_scene
+from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
+from alpasim_plugin.lab.bench.raster import bench_raster
 
 
 def test_rows_pair_each_time_with_the_error_of_its_image():
@@ -49,7 +50,7 @@ def test_scene_depends_on_its_seed_alone_and_covers_the_view():
 @pytest.mark.slow
 def test_kernels_are_compiled_once_and_then_cached(tmp_path):
     code = (
-        "from alpasim_plugin.lab.bench.raster import driving_camera, driving_like_scene;"
+        "from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene;"
         "from alpasim_plugin.gaussians import rasterize; rasterize(driving_like_scene(1000), driving_camera(64, 36))"
     )
 

@@ -17,11 +17,11 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import ChannelNorm
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.op_counter import Op, OpCounter
 from alpasim_plugin.lab.bench.roofline import DEVICES, device_of
+from tests.block_fixers.codec_cases import SMALL, noise
+from tests.block_fixers.codec_cases import clip as video_clip
+from tests.block_fixers.dit_reference import random_weights
 from tests.examples import first_rows_of
 from tests.lab.bench.dit_work import cache_bytes, forward_work
-from tests.nets.codec_cases import SMALL, noise
-from tests.nets.codec_cases import clip as video_clip
-from tests.nets.dit_reference import random_weights
 
 SIZES = DiTSizes(96, 3, 32, 160, 8, 12, 24, 4, 3)
 TOKENS = 15  # 6 x 10 latents

@@ -15,7 +15,7 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench import paper as bench_paper
 from alpasim_plugin.lab.bench import transfer as bench_transfer
 from alpasim_plugin.lab.bench.training_memory import MemoryCell
-from tests.fixers.fixer_cases import small_settings
+from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 
 
@@ -61,6 +61,7 @@ def test_tables_verdicts_and_a_page_and_nothing_is_measured_twice(
     assert {path: path.stat().st_mtime_ns for path in rows} == rows
 
 
+@pytest.mark.slow
 def test_a_second_budget_is_measured_on_the_same_clips_without_measuring_the_shipped_arms_again(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,6 +101,7 @@ def test_a_second_budget_is_measured_on_the_same_clips_without_measuring_the_shi
     assert "### Under both budgets" in text
 
 
+@pytest.mark.slow
 def test_the_transfer_is_measured_zero_shot_and_tuned_beside_the_papers_table(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

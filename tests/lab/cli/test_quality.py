@@ -22,7 +22,7 @@ from alpasim_plugin.lab.cli.quality import parse_variants
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import summarise
-from tests.fixers.fixer_cases import small_settings
+from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 
 FRAMES = 14

@@ -22,7 +22,7 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.cli.training_options import scene_files, whole_numbers
 from policies.learned_net import load_net
-from tests.fixers.fixer_cases import small_settings
+from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 
 BARE = """

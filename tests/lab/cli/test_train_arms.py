@@ -46,6 +46,7 @@ def command(data: Path, *more: str, out: str = "arms", only: str = "omnidreams,s
     return ["train", "arms", str(data / "pairs"), *names, *fixed, *more]
 
 
+@pytest.mark.slow
 def test_arms_share_a_stage_resume_and_are_measured_against_their_time(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     train = command(data, "--steps", "2", "--snapshots", "2")
     assert run_command([*train, "--json"]) == 0

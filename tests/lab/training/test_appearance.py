@@ -30,7 +30,8 @@ from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
-from tests.fixers.fixer_cases import maps_of, moving_picture, pixels, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import run_blocks, small_settings
+from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.corner import make_corner
 
 

@@ -26,7 +26,8 @@ from alpasim_plugin.lab.training.recipes.registry import by_name, recipe_of, wit
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
-from tests.fixers.fixer_cases import SMALL_DIT, fixer, maps_of, moving_picture, pixels, run_blocks
+from tests.block_fixers.fixer_cases import SMALL_DIT, fixer, run_blocks
+from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.test_generator import FORM, clips_of, data  # noqa: F401 - data is a fixture
 
 STEPS = 2  # U

@@ -20,7 +20,8 @@ from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
 from alpasim_plugin.lab.training.trainer import Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
-from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
+from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.test_generator import FORM, brightness, clips_of, data, run_of  # noqa: F401 - data is a fixture
 
 RECIPE = DecoderRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)

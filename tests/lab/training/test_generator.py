@@ -35,7 +35,8 @@ from alpasim_plugin.lab.training.shared_rollout import Objectives
 from alpasim_plugin.lab.training.trainer import Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.headers import read_metadata
-from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
+from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.pair_files import make, pair
 
 FORM = ClipForm(latents=4, stride=7)

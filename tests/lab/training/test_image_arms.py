@@ -27,7 +27,7 @@ from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
 from alpasim_plugin.lab.training.trainer import Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
-from tests.fixers.fixer_cases import moving_picture, pixels
+from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.pair_files import make
 
 TRAINED = {

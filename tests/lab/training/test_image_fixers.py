@@ -23,7 +23,7 @@ from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, Render
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 from alpasim_plugin.plugins.parts import resolve_renderer
-from tests.fixers.fixer_cases import moving_picture, pixels
+from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings
 
 Settings = RenderStepSettings | NoiseWindowSettings

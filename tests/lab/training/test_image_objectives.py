@@ -31,7 +31,7 @@ from alpasim_plugin.lab.training.noise_window import (
 from alpasim_plugin.lab.training.render_step import RenderStep, picture_losses, warp_term
 from alpasim_plugin.lab.training.warping import flow_between, warping_loss
 from alpasim_plugin.nets.schedule import names
-from tests.fixers.fixer_cases import moving_picture, pixels
+from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings
 
 TEXT = torch.zeros(1, 1, 7)

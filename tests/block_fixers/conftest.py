@@ -1,0 +1,23 @@
+"""Fixtures of the block generators' tests: small networks are fastest on one thread, and bit-equality needs the same number throughout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a folder for small weights that tests share (`fixer_cases.busy_settings`)."""
+    return tmp_path_factory.mktemp("weights")

@@ -1,0 +1,179 @@
+"""The rolling cache: one storage for ever, no leaks between rollouts, odd windows and blocks."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from alpasim_plugin.core.errors import InputError
+from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
+
+
+def pointers(cache):
+    return cache.keys.data_ptr(), cache.values.data_ptr()
+
+
+@pytest.mark.parametrize(("window", "sink"), [(6, 0), (5, 1), (2, 0), (1, 0)])
+def test_storage_never_moves_or_grows(window, sink):
+    net = network()
+    x, t, text, hdmap = clip(2)
+    cache = net.new_cache(1, 4, 6, window, sink)
+    before, size = pointers(cache), cache.nbytes
+    tables = set()
+    for _ in range(20):
+        net.step(x, 500.0, text, hdmap, cache, write=False)
+        net.step(x, t, text, hdmap, cache)
+        tables.add(cache.begin(2)[0].data_ptr())
+    assert pointers(cache) == before
+    assert cache.nbytes == size == 2 * 4 * SMALL.blocks * window * 6 * SMALL.width
+    assert len(tables) == 1
+
+
+def test_forward_that_is_not_written_leaves_no_trace():
+    net, (x, t, text, hdmap) = network(), clip(8)
+    quiet, tried = (net.new_cache(1, 4, 6, window=4) for _ in range(2))
+    for start in range(0, 8, 2):
+        cut = slice(start, start + 2)
+        for guess in range(3):
+            net.step(x[:, :, cut] + guess, 700.0, text, hdmap[:, :, cut], tried, write=False)
+        args = (x[:, :, cut], t[:, cut], text, hdmap[:, :, cut])
+        assert torch.equal(net.step(*args, tried), net.step(*args, quiet))
+
+
+def test_two_rollouts_interleaved_are_each_bit_equal_to_alone():
+    net = network()
+    clips = [clip(10, seed=seed) for seed in (1, 2)]
+    alone = [stream(net, net.new_cache(1, 4, 6, 4, 1), *c, (2,) * 5) for c in clips]
+    caches, out = [net.new_cache(1, 4, 6, 4, 1) for _ in clips], [[], []]
+    for start in range(0, 10, 2):
+        cut = slice(start, start + 2)
+        for i, (x, t, text, hdmap) in enumerate(clips):
+            out[i].append(net.step(x[:, :, cut], t[:, cut], text, hdmap[:, :, cut], caches[i]))
+    for i in range(2):
+        assert torch.equal(torch.cat(out[i], 2), alone[i])
+
+
+def test_reset_reproduces_the_same_bits_even_after_nan():
+    net, c = network(), clip(10)
+    cache = net.new_cache(1, 4, 6, 4)
+    first = stream(net, cache, *c, (2,) * 5)
+    net.step(torch.full_like(c[0][:, :, :2], torch.nan), 500.0, c[2], c[3][:, :, :2], cache)
+    cache.reset()
+    assert cache.position == 0
+    assert torch.equal(stream(net, cache, *c, (2,) * 5), first)
+
+
+def test_window_smaller_than_a_block_sees_the_block_and_nothing_else():
+    net, (x, t, text, hdmap) = network(), clip(6)
+    out = stream(net, net.new_cache(1, 4, 6, window=1), x, t, text, hdmap, (3, 3))
+    for start in (0, 3):
+        cut = slice(start, start + 3)
+        with torch.no_grad():
+            alone = net(x[:, :, cut], t[:, cut], text, hdmap[:, :, cut], None, 3, start=start)
+        assert furthest(out[:, :, cut], alone) < 1e-5
+
+
+def test_one_frame_rollout():
+    net, (x, t, text, hdmap) = network(), clip(1)
+    with torch.no_grad():
+        assert furthest(net.step(x, t, text, hdmap, net.new_cache(1, 4, 6)), net(x, t, text, hdmap)) < 1e-6
+
+
+def test_block_opened_again_shorter_after_it_took_old_slots_is_refused():
+    net, (x, t, text, hdmap) = network(), clip(2)
+    cache = net.new_cache(1, 4, 6, window=4)
+    for _ in range(2):
+        net.step(x, t, text, hdmap, cache)
+    net.step(x, t, text, hdmap, cache, write=False)
+    with pytest.raises(InputError, match=r"1 latents after a forward with 2 at latent 4[\s\S]*repeat a block with its first length"):
+        net.step(x[:, :, :1], t[:, :1], text, hdmap[:, :, :1], cache)
+    assert net.step(x, t, text, hdmap, cache).isfinite().all()
+
+
+def test_block_may_be_opened_again_shorter_while_nothing_was_overwritten():
+    net, (x, t, text, hdmap) = network(), clip(2)
+    tried, quiet = (net.new_cache(1, 4, 6, window=4) for _ in range(2))
+    net.step(x, t, text, hdmap, tried, write=False)
+    short = (x[:, :, :1], t[:, :1], text, hdmap[:, :, :1])
+    assert torch.equal(net.step(*short, tried), net.step(*short, quiet))
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda n: n.new_cache(1, 4, 6, window=0), "window 0, sink 0"),
+        (lambda n: n.new_cache(1, 4, 6, window=2, sink=3), "window 2, sink 3"),
+        (lambda n: n.new_cache(1, 4, 6, window=2, sink=-1), "window 2, sink -1"),
+        (lambda n: n.new_cache(1, 5, 6), "latent size 5 x 6"),
+        (lambda n: n.new_cache(0, 4, 6), "batch 0"),
+        (lambda n: n.new_cache(1, 4, 6, window=None), "a fixed buffer needs a length"),
+    ],
+)
+def test_senseless_caches_are_refused(call, text):
+    with pytest.raises(InputError, match=text):
+        call(network())
+
+
+def test_cache_of_another_network_or_size_is_refused():
+    net, (x, t, text, hdmap) = network(), clip(2)
+    other = network(rope_ratios=(1.0, 1.0, 1.0)).new_cache(1, 4, 6)
+    for cache in (net.new_cache(2, 4, 6), net.new_cache(1, 6, 4), other):
+        with pytest.raises(InputError, match="make the cache with this network's new_cache"):
+            net.step(x, t, text, hdmap, cache)
+
+
+def test_steps_run_without_gradients_in_a_rolling_cache():
+    net, (x, t, text, hdmap) = network(), clip(2)
+    cache = net.new_cache(1, 4, 6)
+    v = net.step(x.requires_grad_(), t, text, hdmap, cache)
+    assert not v.requires_grad
+    assert not cache.keys.requires_grad
+
+
+def test_every_wrong_input_is_named():
+    net, (x, t, text, hdmap) = network(), clip(2)
+    bad = [
+        ((x[:, :3], t, text, hdmap), r"x[\s\S]*\[1, 3, 2, 4, 6\]"),
+        ((x[..., :5], t, text, hdmap), r"x[\s\S]*even height and width"),
+        ((x, t[:, :0], text, hdmap), r"with: t\n[\s\S]*\[1, 2\], or one number"),
+        ((x, t[0], text, hdmap), r"with: t\n"),
+        ((x, t, text[..., :4], hdmap), r"text[\s\S]*\(batch or 1, tokens, 7\)"),
+        ((x, t, text[0], hdmap), r"with: text\n"),
+        ((x, t, text, hdmap[:, :, :1]), r"hdmap[\s\S]*\[1, 3, 2, 4, 6\]"),
+        ((x, t, text, hdmap, None, 0), "block_latents"),
+    ]
+    for args, message in bad:
+        with pytest.raises(InputError, match=message):
+            net(*args)
+
+
+@pytest.mark.parametrize("made_inside", [True, False])
+def test_inference_mode_may_begin_and_end_anywhere(made_inside):
+    net, (x, t, text, hdmap) = network(), clip(8)
+    expected = stream(net, net.new_cache(1, 4, 6, 4), x, t, text, hdmap, (2, 2, 2, 2))
+    with torch.inference_mode(made_inside):
+        cache = net.new_cache(1, 4, 6, 4)
+    out = []
+    for start in range(0, 8, 2):
+        cut = slice(start, start + 2)
+        with torch.inference_mode((start // 2 % 2 == 0) == made_inside):
+            out.append(net.step(x[:, :, cut], t[:, cut], text, hdmap[:, :, cut], cache))
+    assert torch.equal(torch.cat(out, 2), expected)
+
+
+def test_reopened_block_sends_nothing_to_the_device_and_a_moved_rotation_is_a_new_one():
+    net = network()
+    cache = net.new_cache(1, 4, 6, 4)
+    cache.begin(2)
+    for position in (0, 2, 126, 10_000):
+        cache.reset(position)
+        table = cache.begin(2)
+        for moved, new in zip(table, net.rope.table(position, 2, 2, 3), strict=True):
+            assert torch.equal(moved, new)
+    made = []
+    cache._token_rows, kept = (lambda latents: made.append(latents)), cache._token_rows
+    cache.begin(2)
+    assert not made
+    cache._token_rows = kept
+    cache.commit()
+    assert (cache.visible, cache.begin(2) is table, cache.visible) == ((2, 0, True), True, (4, 0, True))

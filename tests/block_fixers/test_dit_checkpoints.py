@@ -1,0 +1,254 @@
+"""Weights: every deviation is named, everything a training checkpoint carries besides is tolerated, nothing but tensors is unpickled."""
+
+from __future__ import annotations
+
+import io
+import pickle
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
+from tests.block_fixers.dit_cases import SMALL, clip, furthest
+from tests.block_fixers.dit_reference import random_weights, velocity
+
+KEYS = sorted(SMALL.shapes())
+SQUARE = {key for key, shape in SMALL.shapes().items() if len(shape) < 2 or shape[0] == shape[1]}
+
+
+def load(sd, **options):
+    return CosmosCausalDiT.from_state_dict(sd, **options)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_missing_tensor_is_named(key):
+    sd = random_weights(SMALL)
+    del sd[key]
+    with pytest.raises(InputError) as caught:
+        load(sd, source="weights.safetensors")
+    assert f"missing: {key}" in caught.value.found
+    assert "weights.safetensors" in caught.value.with_what
+    assert "docs/nets.md" in caught.value.do_this
+
+
+@pytest.mark.parametrize("key", [key for key in KEYS if key not in SQUARE])
+def test_transposed_tensor_is_named_alone(key):
+    sd = random_weights(SMALL)
+    sd[key] = sd[key].T.contiguous()
+    shape = SMALL.shapes()[key]
+    with pytest.raises(InputError) as caught:
+        load(sd)
+    assert caught.value.found == f"wrong shape: {key} is {list(shape[::-1])} for {list(shape)}, transposed"
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_mis_shaped_tensor_is_named(key):
+    sd = random_weights(SMALL)
+    sd[key] = torch.cat([sd[key], sd[key][:1]])
+    with pytest.raises(InputError) as caught:
+        load(sd)
+    assert key in caught.value.found
+
+
+def test_whole_missing_block_and_extra_tensors_are_listed_and_counted():
+    sd = random_weights(DiTSizes(**{**SMALL.__dict__, "blocks": 3}))
+    for key in [key for key in sd if key.startswith("blocks.1.")]:
+        del sd[key]
+    sd["blocks.0.cross_view_attn.q_proj.weight"] = torch.zeros(2, 2)
+    with pytest.raises(InputError) as caught:
+        load(sd)
+    assert "missing: blocks.1.adaln_modulation_cross_attn.1.weight" in caught.value.found
+    assert "and 12 more" in caught.value.found
+    assert "unexpected: blocks.0.cross_view_attn.q_proj.weight" in caught.value.found
+
+
+def test_foreign_tensors_are_refused():
+    with pytest.raises(InputError, match=r"no key like blocks\.0"):
+        load({"conv.weight": torch.zeros(3)})
+
+
+def test_heads_that_do_not_divide_the_width_are_refused():
+    sd = random_weights(SMALL)
+    for key in sd:
+        if key.endswith(("q_norm.weight", "k_norm.weight")):
+            sd[key] = torch.ones(10)
+    with pytest.raises(InputError, match=r"width 24 .* with head width 10"):
+        load(sd)
+
+
+def dressed(sd):
+    """Return the same weights as a training run would store them."""
+    out = {f"net.{key.replace('blocks.0.', 'blocks.0._checkpoint_wrapped_module.')}": value for key, value in sd.items()}
+    out |= {f"net_ema.{key}": torch.zeros_like(value) for key, value in sd.items()}
+    out |= {"net.pos_embedder.seq": torch.arange(64.0), "net.pos_embedder.dim_spatial_range": torch.zeros(2)}
+    out |= {"net.pos_embedder.dim_temporal_range": torch.zeros(2), "net.accum_iteration": torch.tensor(7)}
+    out |= {"net.accum_train_in_hours": torch.tensor(1.5), "net.blocks.0.self_attn.q_norm._extra_state": torch.zeros(0)}
+    return out | {"optim.step": torch.tensor(3), "logvar.0.weight": torch.zeros(4, 4)}
+
+
+@pytest.mark.parametrize("wrap", [lambda sd: sd, lambda sd: {"model": sd}, lambda sd: {"state_dict": sd, "epoch": 3}])
+def test_everything_a_training_run_stores_besides_is_tolerated(wrap):
+    sd, c = random_weights(SMALL), clip(3)
+    with torch.no_grad():
+        assert torch.equal(load(wrap(dressed(sd)))(*c), load(sd)(*c))
+
+
+def test_network_owns_a_copy_of_its_weights():
+    sd = random_weights(SMALL)
+    net = load(sd)
+    with torch.no_grad():
+        net.t_embedding_norm.weight.zero_()
+    assert sd["t_embedding_norm.weight"].any()
+
+
+def test_state_dict_of_the_network_has_the_original_keys():
+    sd = random_weights(SMALL)
+    back = load(sd).state_dict()
+    assert set(back) == set(sd)
+    assert all(torch.equal(back[key], sd[key]) for key in sd)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_tensors_are_widened(dtype):
+    sd, c = random_weights(SMALL), clip(3)
+    mixed = sd | {"blocks.0.mlp.layer1.weight": sd["blocks.0.mlp.layer1.weight"].to(dtype)}
+    for weights in (mixed, {key: value.to(dtype) for key, value in sd.items()}):
+        net = load(weights)
+        assert {p.dtype for p in net.parameters()} == {torch.float32}
+        with torch.no_grad():
+            assert furthest(net(*c), velocity(weights, *c)) < 1e-5
+
+
+def test_overflow_on_the_way_to_half_precision_is_named():
+    sd = random_weights(SMALL)
+    sd["x_embedder.proj.1.weight"][0, 0] = 1e5
+    with pytest.raises(InputError, match=r"x_embedder.proj.1.weight holds 1e\+05, beyond torch.float16"):
+        load(sd, dtype=torch.float16)
+    assert load(sd, dtype=torch.bfloat16).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_named(value):
+    sd = random_weights(SMALL)
+    sd["blocks.1.mlp.layer2.weight"][2, 3] = value
+    with pytest.raises(InputError, match=r"blocks.1.mlp.layer2.weight holds 1 values that are not finite, of 960"):
+        load(sd)
+
+
+def test_integer_weights_are_named():
+    sd = random_weights(SMALL)
+    sd["final_layer.linear.weight"] = sd["final_layer.linear.weight"].to(torch.int8)
+    with pytest.raises(InputError, match=r"final_layer.linear.weight holds torch.int8[\s\S]*quantise after loading"):
+        load(sd)
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+def test_safetensors_round_trip_with_digest_and_precision(tmp_path):
+    sd = random_weights(SMALL)
+    path = tmp_path / "net.safetensors"
+    write_safetensors(path, sd, {"made": "test"})
+    assert [p.name for p in tmp_path.iterdir()] == ["net.safetensors"]
+    back = load_weights(path, sha256=file_sha256(path).upper())
+    assert all(torch.equal(back[key], sd[key]) for key in sd)
+    assert {value.dtype for value in load_weights(path, torch.bfloat16).values()} == {torch.bfloat16}
+    with pytest.raises(InputError, match=f"sha256 {file_sha256(path)}, not 00"):
+        load_weights(path, sha256="00")
+
+
+def test_safetensors_whose_length_begins_like_a_pickle_loads(tmp_path):
+    path = tmp_path / "x.safetensors"
+    for pad in range(600):
+        save_file({"a": torch.ones(2)}, path, {"pad": "x" * pad})
+        if path.read_bytes()[:2] == b"\x80\x02":
+            break
+    assert path.read_bytes()[:2] == b"\x80\x02"
+    assert torch.equal(load_weights(path)["a"], torch.ones(2))
+
+
+def test_integer_tensors_keep_their_type_when_others_are_converted(tmp_path):
+    save_file({"a": torch.ones(2), "n": torch.tensor([3])}, tmp_path / "x.safetensors")
+    back = load_weights(tmp_path / "x.safetensors", torch.float16)
+    assert (back["a"].dtype, back["n"].dtype) == (torch.float16, torch.int64)
+
+
+@pytest.mark.parametrize("keep", [0, 5, 100, -100])
+def test_truncated_safetensors_is_refused(tmp_path, keep):
+    path = tmp_path / "net.safetensors"
+    write_safetensors(path, random_weights(SMALL))
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match=r"not a complete safetensors file of \d+ bytes[\s\S]*truncated or of another format"):
+        load_weights(path)
+
+
+def test_text_file_and_missing_file_are_refused(tmp_path):
+    (tmp_path / "a.safetensors").write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(InputError, match="not a complete safetensors file"):
+        load_weights(tmp_path / "a.safetensors")
+    with pytest.raises(InputError, match="no such file"):
+        load_weights(tmp_path / "b.safetensors")
+
+
+@pytest.mark.parametrize("name", ["model.pt", "renamed.safetensors"])
+@pytest.mark.parametrize("legacy", [False, True])
+def test_torch_file_of_tensors_loads(tmp_path, name, legacy):
+    sd = random_weights(SMALL)
+    torch.save({"model": dressed(sd)}, tmp_path / name, _use_new_zipfile_serialization=not legacy)
+    back = CosmosCausalDiT.from_state_dict(load_weights(tmp_path / name))
+    assert all(torch.equal(value, sd[key]) for key, value in back.state_dict().items())
+
+
+class Trap:
+    """Writes a file when unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("plain", [False, True])
+def test_pickle_with_code_is_refused_and_not_run(tmp_path, plain):
+    path, sprung = tmp_path / "net.safetensors", tmp_path / "sprung"
+    content = {"a": torch.zeros(1), "trap": Trap(sprung)}
+    if plain:
+        path.write_bytes(pickle.dumps({"trap": Trap(sprung)}))
+    else:
+        torch.save(content, path)
+    with pytest.raises(InputError, match=r"a pickle that holds more than tensors \(Unsupported .*\); loading it could run code"):
+        load_weights(path)
+    assert not sprung.exists()
+
+
+def test_pickled_byte_buffers_of_transformer_engine_are_tolerated(tmp_path):
+    sd = {**random_weights(SMALL), "blocks.0.self_attn.q_norm._extra_state": io.BytesIO(b"\x80")}
+    torch.save(sd, tmp_path / "net.pt")
+    assert "blocks.0.self_attn.q_norm._extra_state" not in load_weights(tmp_path / "net.pt")
+
+
+def test_truncated_torch_file_is_refused(tmp_path):
+    path = tmp_path / "net.pt"
+    torch.save(random_weights(SMALL), path)
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(InputError, match="truncated or damaged torch file"):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"a": 3}, {"model": {"epoch": 1}}])
+def test_torch_file_without_tensors_is_refused(tmp_path, content):
+    torch.save(content, tmp_path / "x.pt")
+    with pytest.raises(InputError, match="without tensors"):
+        load_weights(tmp_path / "x.pt")
+
+
+def test_other_things_between_tensors_are_named():
+    with pytest.raises(InputError, match="config is a dict"):
+        load({**random_weights(SMALL), "config": {}})

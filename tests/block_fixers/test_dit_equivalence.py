@@ -1,0 +1,205 @@
+"""Two execution paths, one network: whole clip, blocks through either cache, and the written-out reference agree."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.block_fixers.attention import block_causal_attention
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from tests.block_fixers.attention_reference import block_causal_reference
+from tests.block_fixers.cache_history import history
+from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
+from tests.block_fixers.dit_reference import latent_mask, random_weights, velocity
+from tests.examples import examples
+
+SIZES = [
+    SMALL,
+    DiTSizes(16, 1, 16, 24, 3, 5, 16, 16, 16),  # one block, one head, context as wide as the stream
+    DiTSizes(96, 3, 8, 64, 96, 11, 6, 16, 1),  # many heads of the smallest useful width, square AdaLN, map of one channel
+    DiTSizes(64, 2, 64, 256, 16, 48, 40, 16, 16),
+    DiTSizes(20, 2, 10, 33, 4, 3, 2, 5, 7),  # no power of two anywhere
+    DiTSizes(24, 2, 12, 40, 5, 7, 9, 4, 3, 6),  # every block sees the opacity
+]
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
+@pytest.mark.parametrize(("frames", "block", "ratios"), [(5, 2, (3.0, 3.0, 1.0)), (3, 3, (1.0, 2.0, 1.5)), (1, 2, (1.0, 1.0, 1.0))])
+def test_network_is_the_written_out_one_at_any_size(sizes, frames, block, ratios):
+    weights = random_weights(sizes, 3)
+    x, t, text, hdmap = clip(frames, sizes, batch=2)
+    mask = (torch.rand(2, 1, frames, 4, 6, generator=torch.Generator().manual_seed(0)) > 0.5).float()
+    net = network(sizes, 3, rope_ratios=ratios)
+    assert net.sizes == sizes
+    with torch.no_grad():
+        v = net(x, t, text, hdmap, mask, block)
+    assert furthest(v, velocity(weights, x, t, text, hdmap, mask, block, ratios)) < 1e-4
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    blocks=st.lists(st.integers(1, 4), min_size=1, max_size=5),
+    window=st.integers(1, 12),
+    sink=st.integers(0, 4),
+    batch=st.integers(1, 2),
+    size=st.sampled_from([(2, 2), (4, 6), (6, 2)]),
+)
+def test_rolling_cache_is_the_growing_one(blocks, window, sink, batch, size):
+    sink = min(sink, window)
+    net = network()
+    x, t, text, hdmap = clip(sum(blocks), batch=batch, height=size[0], width=size[1])
+    caches = [net.new_cache(batch, *size, window, sink, keeps_graph=graph) for graph in (False, True)]
+    out = [stream(net, cache, x, t, text, hdmap, blocks).detach() for cache in caches]
+    assert furthest(*out) < 1e-5
+    for layer in range(SMALL.blocks):
+        for ours, other in zip(history(caches[0], layer), history(caches[1], layer), strict=True):
+            assert furthest(ours, other) < 1e-5
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    frames=st.integers(1, 9),
+    block=st.integers(1, 4),
+    window=st.integers(1, 10),
+    sink=st.integers(0, 3),
+    size=st.sampled_from([(2, 2), (4, 6)]),
+)
+def test_blocks_through_a_cache_are_the_whole_clip_under_the_same_window(frames, block, window, sink, size):
+    sink = min(sink, window)
+    net = network()
+    x, t, text, hdmap = clip(frames, height=size[0], width=size[1])
+    lengths = [min(block, frames - start) for start in range(0, frames, block)]
+    with torch.no_grad():
+        blocks = stream(net, net.new_cache(1, *size, window, sink), x, t, text, hdmap, lengths)
+        assert furthest(blocks, net(x, t, text, hdmap, None, block, window=window, sink=sink)) < 1e-5
+        if window >= frames:
+            assert furthest(blocks, net(x, t, text, hdmap, None, block)) < 1e-5
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(
+    frames=st.integers(1, 8),
+    block=st.integers(1, 5),
+    window=st.none() | st.integers(1, 9),
+    sink=st.integers(0, 3),
+    tokens=st.integers(1, 3),
+)
+def test_attention_without_a_mask_is_attention_with_one(frames, block, window, sink, tokens):
+    sink = min(sink, window) if window is not None else 0
+    g = torch.Generator().manual_seed(frames)
+    q, k, v = (torch.randn(2, frames * tokens, 2, 4, generator=g) for _ in range(3))
+    fast = block_causal_attention(q, k, v, tokens, block, window, sink)
+    assert furthest(fast, block_causal_reference(q, k, v, tokens, block, window, sink)) < 1e-6
+
+
+def test_later_blocks_do_not_reach_earlier_ones():
+    net = network()
+    x, t, text, hdmap = clip(6)
+    with torch.no_grad():
+        before = net(x, t, text, hdmap)
+        changed_x, changed_map = x.clone(), hdmap.clone()
+        changed_x[:, :, 4:] += 1
+        changed_map[:, :, 4:] -= 1
+        after = net(changed_x, t, text, changed_map)
+    assert torch.equal(before[:, :, :4], after[:, :, :4])
+    assert furthest(before[:, :, 4:], after[:, :, 4:]) > 0.1
+
+
+def test_past_beyond_the_window_is_forgotten_and_the_sink_is_not():
+    one_layer = network(DiTSizes(**{**SMALL.__dict__, "blocks": 1}))  # several layers would pass it on from block to block
+    x, t, text, hdmap = clip(8)
+    far, sunk = x.clone(), x.clone()
+    far[:, :, 2:4] += 5
+    sunk[:, :, 0:2] += 5
+    with torch.no_grad():
+        last = [one_layer(a, t, text, hdmap, window=6, sink=2)[:, :, 6:] for a in (x, far, sunk)]
+    assert torch.equal(last[0], last[1])
+    assert furthest(last[0], last[2]) > 1e-3
+
+
+def test_the_mask_of_a_window_is_what_the_reference_says():
+    expected = torch.tensor([[1, 1, 0, 0, 0, 0], [1, 1, 1, 1, 0, 0], [1, 0, 0, 1, 1, 1]]).bool()
+    assert torch.equal(latent_mask(6, 2, window=4, sink=1), expected.repeat_interleave(2, 0))
+    weights = random_weights(SMALL)
+    x, t, text, hdmap = clip(6)
+    with torch.no_grad():
+        v = network()(x, t, text, hdmap, window=4, sink=1)
+    assert furthest(v, velocity(weights, x, t, text, hdmap, window=4, sink=1)) < 1e-5
+
+
+@pytest.mark.parametrize("tokens", [1, 5])
+def test_prepared_text_is_the_text(tokens):
+    net = network()
+    x, t, text, hdmap = clip(4, tokens=tokens)
+    with torch.no_grad():
+        assert torch.equal(net(x, t, net.encode_text(text), hdmap), net(x, t, text, hdmap))
+        assert furthest(net(x, t, text, hdmap), velocity(random_weights(SMALL), x, t, text, hdmap)) < 1e-5
+
+
+def test_one_prompt_serves_a_batch_of_views():
+    net = network()
+    x, t, text, hdmap = clip(2, batch=3)
+    with torch.no_grad():
+        views = net(x, t, text[:1], hdmap)
+        assert furthest(views, net(x, t, text[:1].expand(3, -1, -1), hdmap)) < 1e-5
+        alone = torch.cat([net(x[i : i + 1], t[i : i + 1], text[:1], hdmap[i : i + 1]) for i in range(3)])
+    assert furthest(views, alone) < 1e-5
+
+
+def test_a_number_is_a_time_step_for_every_latent():
+    net = network()
+    x, _, text, hdmap = clip(4)
+    with torch.no_grad():
+        by_latent = net(x, torch.full((1, 4), 357.0), text, hdmap)
+        assert furthest(net(x, 357.0, text, hdmap), by_latent) < 1e-5
+        assert furthest(net(x, torch.full((1, 1), 357.0), text, hdmap), by_latent) < 1e-5
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
+@pytest.mark.parametrize("t", [1000.0, 803.5714, 128.0])
+def test_folded_network_is_an_exact_rewrite(sizes, t):
+    net = network(sizes)
+    folded = net.folded(t)
+    x, _, text, hdmap = clip(4, sizes)
+    with torch.no_grad():
+        assert furthest(folded(x, t, text, hdmap), net(x, t, text, hdmap)) < 1e-5
+    assert not any("adaln" in name for name, _ in folded.named_parameters())
+
+
+def test_folded_and_plain_network_share_a_cache():
+    net, (x, _, text, hdmap) = network(), clip(4)
+    folded = net.folded(1000.0)
+    plain_cache, cache = (net.new_cache(1, 4, 6, window=4) for _ in range(2))
+    for start in (0, 2):
+        cut = slice(start, start + 2)
+        v = net.step(x[:, :, cut], 1000.0, text, hdmap[:, :, cut], plain_cache, False)
+        w = folded.step(x[:, :, cut], 1000.0, text, hdmap[:, :, cut], cache, False)
+        assert furthest(v, w) < 1e-5
+        for c in (plain_cache, cache):
+            net.step(x[:, :, cut], 128.0, text, hdmap[:, :, cut], c, True)
+
+
+def test_gradients_reach_back_as_far_as_the_history_is_not_cut():
+    net, (x, t, text, hdmap) = network(), clip(6)
+    for cut_after, reached in ((None, [True, True]), (1, [False, True]), (2, [False, False])):
+        leaf = x.clone().requires_grad_()
+        cache = net.new_cache(1, 4, 6, window=6, keeps_graph=True)
+        for block in range(3):
+            if block == cut_after:
+                cache = cache.fork()
+            cut = slice(2 * block, 2 * block + 2)
+            v = net.step(leaf[:, :, cut], t[:, cut], text, hdmap[:, :, cut], cache)
+        (grad,) = torch.autograd.grad(v.square().sum(), leaf)
+        assert [bool(grad[:, :, cut].abs().max() > 0) for cut in (slice(0, 2), slice(2, 4))] == reached
+        assert grad[:, :, 4:].abs().max() > 0
+
+
+def test_gradients_of_a_clip_are_those_of_its_blocks():
+    net, (x, t, text, hdmap) = network(), clip(4)
+    cache = net.new_cache(1, 4, 6, window=None, keeps_graph=True)
+    whole = torch.autograd.grad(net(x, t, text, hdmap).square().mean(), list(net.parameters()))
+    blocks = torch.autograd.grad(stream(net, cache, x, t, text, hdmap, (2, 2)).square().mean(), list(net.parameters()))
+    for a, b in zip(whole, blocks, strict=True):
+        assert furthest(a, b) < 1e-5

@@ -1,0 +1,165 @@
+"""Settings of fixers: files, overrides, names, and what is refused."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
+from alpasim_plugin.core.errors import FixerError, InputError
+from alpasim_plugin.fixers import fixer_settings, make_fixer
+from alpasim_plugin.fixers.settings import FixerSettings, WeightsSettings, load_settings
+from alpasim_plugin.plugins.interfaces import BlockRule
+from alpasim_plugin.plugins.parts import names
+from tests.block_fixers.fixer_cases import small_settings
+
+
+def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
+    with pytest.raises(InputError) as caught:
+        fixer_settings(name, overrides)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["onefixer", "onefixer-m", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"])
+def test_every_fixer_has_settings_that_load(name: str) -> None:
+    assert name in names("fixer")
+    assert isinstance(fixer_settings(name), FixerSettings)
+
+
+def test_sizes_are_what_their_names_promise() -> None:
+    def millions(name: str) -> float:
+        settings = fixer_settings(name)
+        assert isinstance(settings, OneFixerSettings)
+        return DiTSizes(**settings.dit.model_dump()).parameters / 1e6
+
+    assert 2.5 < millions("onefixer-dit-tiny") < 3
+    assert 20 < millions("onefixer-dit-s") < 60
+    big = fixer_settings("onefixer-2b")
+    assert isinstance(big, OneFixerSettings)
+    assert DiTSizes(**big.dit.model_dump()) == DiTSizes()
+
+
+def test_step_count_after_the_name() -> None:
+    four = fixer_settings("onefixer-dit-tiny@4", ["window=8"])
+    assert isinstance(four, OneFixerSettings)
+    assert four.steps == (1000, 750, 500, 250)
+    assert four.window == 8
+    assert "no step count" in refusal(name="onefixer@0")
+    assert "no step count" in refusal(name="onefixer@many")
+    assert "did you mean 'onefixer'" in refusal(name="onefixr")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("windw=4", ("--set fixer.windw=4", "did you mean 'window'")),
+        ("decoder.kin=latent", ("unknown key 'kin' in decoder", "did you mean 'kind'")),
+        ("decoder.kind=rendr", ("did you mean 'render'",)),
+        ("window=0", ("window = 0",)),
+        ("window=four", ("window = 'four'",)),
+        ("sink=7", ("sink 7 in a window of 6",)),
+        ("steps=[500]", ("falling from 1000",)),
+        ("steps=[1000, 1000]", ("falling from 1000",)),
+        ("decoder.kind=taehv", ("vae.kind wan",)),
+        ("weights.sha256.ditt=00", ("unknown key 'ditt'", "did you mean 'dit'")),
+        ("precision=fp8", ("precision is 'fp8'",)),
+        ("precision=int8", ("precision is 'int8'", "fp32")),
+        ("tolerance_m=-1", ("tolerance_m = -1",)),
+    ],
+)
+def test_bad_values_are_named_with_their_place(override: str, words: tuple[str, ...]) -> None:
+    text = refusal(override)
+    for word in words:
+        assert word in text
+
+
+def test_only_the_tiny_autoencoder_sees_the_render() -> None:
+    assert "only the tiny autoencoder" in refusal("weights.bundle=null", "vae.kind=wan")
+
+
+def test_a_bundle_and_parts_do_not_go_together() -> None:
+    assert "give the bundle alone" in refusal("weights.bundle=a", "weights.dit=b")
+
+
+def test_paths_start_where_they_were_written() -> None:
+    settings = fixer_settings("onefixer-dit-tiny", ["weights.dit=nets/a.safetensors", "weights.vae=/b.safetensors"])
+    assert isinstance(settings, OneFixerSettings)
+    assert settings.weights.dit == str(Path.cwd() / "nets/a.safetensors")
+    assert settings.weights.vae == "/b.safetensors"
+
+
+def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped = tmp_path / "shipped.yaml"
+    plain = Path(str(resources.files("configs.fixers"))) / "onefixer-dit-tiny.yaml"
+    shipped.write_text(plain.read_text().partition("weights:")[0] + "weights: {bundle: here.safetensors}\n")
+    monkeypatch.setattr("alpasim_plugin.fixers.settings.resources.files", lambda package: tmp_path)
+
+    def weights(*overrides: str) -> WeightsSettings:
+        return load_settings("shipped", OneFixerSettings, overrides).weights
+
+    assert weights().bundle == str(tmp_path / "here.safetensors")
+    assert weights("window=4").bundle == str(tmp_path / "here.safetensors")
+    assert (weights("weights.dit=/a").bundle, weights("weights.dit=/a").dit) == (None, "/a")
+    assert weights("weights.bundle=/b").bundle == "/b"
+    assert weights("weights.bundle=null", "dit.width=24").bundle is None
+    with pytest.raises(InputError, match=r"fixer\.dit\.width[\s\S]*have their sizes[\s\S]*weights\.bundle=null"):
+        weights("dit.width=24")
+
+
+def test_the_large_fixer_does_not_go_without_weights() -> None:
+    with pytest.raises(InputError, match=r"weights\.dit=FILE"):
+        make_fixer("onefixer-2b", scene_id="scene")
+
+
+def test_widths_of_an_untrained_tiny_autoencoder() -> None:
+    vae = load_networks(small_settings("vae.widths=[8,16,12,10,6]")).vae
+    assert isinstance(vae, TinyVAE)
+    assert vae.sizes == TinySizes(8, 16, 12, 10, 6)
+    assert load_networks(small_settings()).vae.sizes == TinySizes(32, 48, 48, 32, 16)
+    assert "vae.widths" in refusal("vae.widths=[8,16]")
+
+
+def test_an_untrained_wan_autoencoder_is_no_identity() -> None:
+    with pytest.raises(InputError, match="not an identity"):
+        load_networks(small_settings("vae.kind=wan", "decoder.kind=latent"))
+
+
+def test_a_device_that_does_not_work_is_named() -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a CUDA device")
+    with pytest.raises(FixerError, match="no CUDA device"):
+        load_networks(small_settings(), "cuda")
+
+
+def test_how_the_loop_uses_a_fixer_does_not_load_its_networks_again() -> None:
+    one, other = small_settings("mode=chunk"), small_settings("tolerance_m=0.5")
+    assert load_networks(one) is load_networks(other)
+    assert load_networks(one) is not load_networks(small_settings("window=4"))
+
+
+def test_block_rule() -> None:
+    rule = BlockRule.of_latents(3)
+    assert [rule.frames(i) for i in range(3)] == [9, 12, 12]
+
+
+def test_identity_passes_frames_on_and_checks_blocks() -> None:
+    from tests.fixers.clip_cases import moving_picture
+
+    session = make_fixer("identity", scene_id="scene")
+    frames = moving_picture(13)
+    assert session.label == "identity, no network"
+    assert list(session.step(frames[:5], [])) == frames[:5]
+    assert list(session.preview(frames[5:13], [])) == frames[5:13]
+    with pytest.raises(InputError, match="at most 8"):
+        session.step(frames[4:13], [])
+    session.reset(0)
+    with pytest.raises(InputError, match="at most 5"):
+        session.step(frames[5:13], [])

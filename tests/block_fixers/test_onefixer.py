@@ -1,0 +1,260 @@
+"""The streaming session: rollouts, blocks, cameras, previews."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.types import Frame
+from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.plugins.interfaces import Fixer
+from tests.block_fixers.fixer_cases import busy_settings, fixer, record_videos, run_blocks, small_settings
+from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
+
+FRAMES = moving_picture(29)
+MAPS = maps_of(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def busy(weights: Path) -> OneFixerSettings:
+    return busy_settings(weights)
+
+
+@pytest.fixture(scope="module")
+def alone(busy) -> np.ndarray:
+    """What a rollout of its own makes of the clip."""
+    return pixels(run_blocks(fixer(busy), FRAMES, MAPS))
+
+
+def test_a_session_keeps_both_contracts(busy) -> None:
+    session = fixer(busy)
+    assert isinstance(session, Fixer)
+    assert isinstance(session, Fixer)
+    out = session.step(FRAMES[:5], MAPS[:5])
+    assert [(frame.t_us, frame.camera, frame.rgb.dtype, frame.rgb.shape) for frame in out] == [
+        (frame.t_us, frame.camera, np.uint8, (*SIZE, 3)) for frame in FRAMES[:5]
+    ]
+    assert np.abs(pixels(list(out)).astype(int) - pixels(FRAMES[:5])).mean() > 2  # these weights do something
+
+
+def test_stages_add_up_to_less_than_the_calls_and_a_committed_draft_costs_only_its_write(busy) -> None:
+    session = fixer(busy)
+    assert session.stage_ms == {"encode": 0.0, "dit": 0.0, "decode": 0.0, "cache write": 0.0}
+    began = time.perf_counter()
+    session.preview(FRAMES[:5], MAPS[:5])
+    drafted = session.stage_ms
+    assert all(drafted[stage] > 0 for stage in ("encode", "dit", "decode"))
+    session.step(FRAMES[:5], MAPS[:5])
+    kept = session.stage_ms
+    assert sum(kept.values()) <= 1e3 * (time.perf_counter() - began)
+    assert kept["cache write"] > drafted["cache write"] == 0
+    assert kept == drafted | {"cache write": kept["cache write"]}
+
+
+def test_reset_reproduces_a_rollout_bit_by_bit(busy, alone: np.ndarray) -> None:
+    session = fixer(busy, seed=3)
+    other_seed = pixels(run_blocks(session, FRAMES, MAPS))
+    session.reset(0)
+    assert np.array_equal(pixels(run_blocks(session, FRAMES, MAPS)), alone)
+    assert not np.array_equal(other_seed, alone)
+
+
+def test_noise_follows_scene_seed_and_camera_and_nothing_else(busy, alone: np.ndarray) -> None:
+    assert np.array_equal(pixels(run_blocks(fixer(busy), FRAMES, MAPS)), alone)
+    assert not np.array_equal(pixels(run_blocks(fixer(busy, scene_id="elsewhere"), FRAMES, MAPS)), alone)
+    renamed = [replace(frame, camera="rear") for frame in FRAMES]
+    assert not np.array_equal(pixels(run_blocks(fixer(busy), renamed, MAPS)), alone)
+
+
+def test_two_rollouts_interleaved_never_mix(busy, alone: np.ndarray) -> None:
+    frames = moving_picture(29, key="other")
+    maps = maps_of(frames)
+    other = pixels(run_blocks(fixer(busy, seed=1), frames, maps))
+    first, second = fixer(busy), fixer(busy, seed=1)
+    a: list[Frame] = []
+    b: list[Frame] = []
+    for start, end in ((0, 5), (5, 13), (13, 21), (21, 29)):
+        a += first.step(FRAMES[start:end], MAPS[start:end])
+        second.preview(frames[start:end], maps[start:end])
+        b += second.step(frames[start:end], maps[start:end])
+    assert np.array_equal(pixels(a), alone)
+    assert np.array_equal(pixels(b), other)
+
+
+@pytest.mark.parametrize("history", ["last-forward", "finalise"])
+def test_previews_of_guessed_frames_leave_no_trace(weights: Path, history: str) -> None:
+    settings = busy_settings(weights, f"history={history}", "window=4")
+    alone = pixels(run_blocks(fixer(settings), FRAMES, MAPS))
+    guesses = moving_picture(29, key="guess")
+    session = fixer(settings)
+    out: list[Frame] = []
+    for start, end in ((0, 5), (5, 13), (13, 21), (21, 29)):
+        for shown in (1, 3):  # poses known so far, then poses guessed
+            known = [*FRAMES[start : start + shown], *guesses[start + shown : end]]
+            session.preview(known, MAPS[start:end])
+        session.preview(FRAMES[start : start + 2], MAPS[start : start + 2])
+        out += session.step(FRAMES[start:end], MAPS[start:end])
+    assert np.array_equal(pixels(out), alone)
+
+
+def test_a_step_equal_to_the_last_preview_is_not_computed_again(busy, alone: np.ndarray) -> None:
+    session = fixer(busy)
+    videos = record_videos(session)
+    out: list[Frame] = []
+    for start, end in ((0, 5), (5, 13)):
+        previewed = session.preview(FRAMES[start:end], MAPS[start:end])
+        repeated = session.preview(FRAMES[start:end], MAPS[start:end])
+        out += session.step(FRAMES[start:end], MAPS[start:end])
+        assert np.array_equal(pixels(list(previewed)), pixels(out[start:]))
+        assert np.array_equal(pixels(list(repeated)), pixels(out[start:]))
+    assert len(videos) == 2
+    assert np.array_equal(pixels(out), alone[:13])
+    changed = replace(FRAMES[13], alpha=np.full(SIZE, 0.25, np.float32))
+    session.preview(FRAMES[13:21], MAPS[13:21])
+    session.step([changed, *FRAMES[14:21]], MAPS[13:21])
+    assert len(videos) == 4, "an opacity alone makes another block"
+
+
+def test_the_past_matters_and_the_future_does_not(busy, alone: np.ndarray) -> None:
+    other_past = [*moving_picture(13, key="other"), *FRAMES[13:]]
+    assert not np.array_equal(pixels(run_blocks(fixer(busy), other_past, MAPS))[13:], alone[13:])
+    other_future = [*FRAMES[:13], *moving_picture(29, key="other")[13:]]
+    assert np.array_equal(pixels(run_blocks(fixer(busy), other_future, MAPS))[:13], alone[:13])
+
+
+def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
+    left = moving_picture(21, key="left", camera="left")
+    right = moving_picture(21, key="right", camera="right", holes=False)
+    maps = {"left": maps_of(left), "right": maps_of(right)}
+    videos: dict[str, torch.Tensor] = {}
+    images = {}
+    for name, frames in (("left", left), ("right", right)):
+        session = fixer(busy)
+        seen = record_videos(session)
+        images[name] = pixels(run_blocks(session, frames, maps[name]))
+        videos[name] = torch.cat(seen, dim=2)
+    session = fixer(busy)
+    seen = record_videos(session)
+    out: list[Frame] = []
+    for start, end in ((0, 5), (5, 13), (13, 21)):
+        mixed = [frame for pair in zip(right[start:end], left[start:end], strict=True) for frame in pair]
+        mixed_maps = [m for pair in zip(maps["right"][start:end], maps["left"][start:end], strict=True) for m in pair]
+        order = np.argsort([0 if i % 3 else 1 for i in range(len(mixed))], kind="stable")
+        answer = session.step([mixed[i] for i in order], [mixed_maps[i] for i in order])
+        assert [(f.camera, f.t_us) for f in answer] == [(mixed[i].camera, mixed[i].t_us) for i in order]
+        out += sorted(answer, key=lambda f: f.t_us)
+    together = torch.cat(seen, dim=2)
+    for b, name in enumerate(("left", "right")):
+        assert float((together[b] - videos[name][0]).abs().max()) < 1e-5
+        mine = pixels([frame for frame in out if frame.camera == name])
+        assert np.abs(mine.astype(int) - images[name]).max() <= 1
+
+
+def test_cameras_of_two_sizes_share_a_rollout(busy) -> None:
+    wide = moving_picture(13, size=(32, 64), camera="wide")
+    session = fixer(busy)
+    out: list[Frame] = []
+    for start, end in ((0, 5), (5, 13)):
+        out += session.step([*FRAMES[start:end], *wide[start:end]], [*MAPS[start:end], *maps_of(wide[start:end])])
+    for frames in (FRAMES[:13], wide):
+        camera = frames[0].camera
+        mine = pixels([frame for frame in out if frame.camera == camera])
+        single = fixer(busy)
+        assert np.array_equal(mine, pixels(run_blocks(single, frames, maps_of(frames))))
+
+
+def test_map_is_seen_only_where_the_settings_use_it(weights: Path) -> None:
+    seen, unseen = busy_settings(weights), busy_settings(weights, "uses_map=false")
+    black = [np.zeros_like(m) for m in MAPS[:5]]
+
+    def first_block(settings, maps) -> np.ndarray:
+        return pixels(list(fixer(settings).step(FRAMES[:5], maps)))
+
+    assert not np.array_equal(first_block(seen, MAPS[:5]), first_block(seen, black))
+    assert not np.array_equal(first_block(seen, black), first_block(seen, []))  # a black map says "no road", none says nothing
+    assert np.array_equal(first_block(unseen, MAPS[:5]), first_block(unseen, []))
+
+
+# --- untrained ------------------------------------------------------------------------------------------------------
+
+
+def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through() -> None:
+    session = make_fixer("onefixer-dit-tiny", small_settings(), scene_id="scene")
+    assert not session.trained
+    assert session.label == "onefixer-dit-tiny, untrained (identity)"
+    frames = moving_picture(21, holes=False)
+    out = pixels(run_blocks(session, frames, MAPS))
+    assert np.array_equal(out, pixels(frames))
+
+
+def test_an_untrained_fixer_is_the_autoencoders_round_trip() -> None:
+    session = fixer(small_settings("decoder.kind=latent"))
+    frames = moving_picture(21)
+    video = torch.from_numpy(pixels(frames)).float().permute(3, 0, 1, 2)[None] / 127.5 - 1
+    vae = session.networks.vae
+    expected = ((vae.decode(vae.encode(video)) + 1) * 127.5).round()[0].permute(1, 2, 3, 0)
+    out = pixels(run_blocks(session, frames, MAPS)).astype(int)
+    assert np.abs(out - expected.numpy()).max() <= 1
+    assert 1 < np.abs(out - pixels(frames)).mean() < 40  # blurred, not lost
+
+
+def test_steps_after_the_name_are_in_the_label() -> None:
+    session = make_fixer("onefixer-dit-tiny@2", small_settings("steps=[1000,500]"), scene_id="scene")
+    assert session.label == "onefixer-dit-tiny@2, untrained (identity)"
+
+
+# --- blocks that are refused ----------------------------------------------------------------------------------------
+
+
+def refused(session, block, maps, *words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        session.step(block, maps)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_blocks_that_do_not_continue_the_rollout_are_refused(busy) -> None:
+    session = fixer(busy)
+    first = pixels(list(session.step(FRAMES[:5], MAPS[:5])))
+    refused(session, FRAMES[:8], MAPS[:8], "0 us after one at 400000 us", "order of time")
+    refused(session, [replace(f, camera="rear") for f in FRAMES[5:13]], MAPS[5:13], "'rear'", "'front'", "same cameras")
+    refused(session, moving_picture(13, size=(48, 48))[5:], maps_of(moving_picture(8, size=(48, 48))), "(48, 48)", "(32, 48)")
+    refused(session, FRAMES[5:13], [], "no map after blocks with one")
+    refused(session, FRAMES[5:14], MAPS[5:14], "{'front': 9}", "at most 8")
+    out = session.step(FRAMES[5:13], MAPS[5:13])
+    again = fixer(busy)
+    assert np.array_equal(pixels(list(again.step(FRAMES[:5], MAPS[:5]))), first)
+    assert np.array_equal(pixels(list(again.step(FRAMES[5:13], MAPS[5:13]))), pixels(list(out))), "refusals leave no trace"
+
+
+def test_blocks_that_are_none_are_refused(busy) -> None:
+    session = fixer(busy)
+    refused(session, [], [], "no frames")
+    refused(session, FRAMES[:5], MAPS[:4], "4 for 5 frames")
+    refused(session, [*FRAMES[:2], replace(FRAMES[2], camera="rear")], [], "{'front': 2, 'rear': 1}")
+    refused(session, [FRAMES[0], FRAMES[0]], [], "two frames at one time")
+    refused(session, [replace(FRAMES[0], rgb=FRAMES[0].rgb.astype(np.float32))], [], "float32")
+    refused(session, [replace(FRAMES[0], alpha=np.ones((8, 8), np.float32))], [], "alpha of (8, 8)")
+    refused(session, FRAMES[:1], [np.zeros((8, 8, 3), np.uint8)], "map of camera 'front' at 0 us")
+
+
+@pytest.mark.parametrize("value", [np.nan, 1.2, -0.1, np.inf])
+def test_an_opacity_that_is_none_is_the_renderers_fault(busy, value: float) -> None:
+    alpha = np.ones(SIZE, np.float32)
+    alpha[3, 4] = value
+    with pytest.raises(RendererError, match="camera 'front' at 0 us"):
+        fixer(busy).step([replace(FRAMES[0], alpha=alpha)], MAPS[:1])
+
+
+def test_settings_of_another_fixer_are_refused() -> None:
+    from alpasim_plugin.fixers import fixer_settings
+
+    with pytest.raises(InputError, match="fixer_settings"):
+        make_fixer("onefixer-dit-tiny", fixer_settings("identity"), scene_id="scene")

@@ -1,0 +1,199 @@
+"""Opacity mixing, flow steps, schedule and the block sampler read like their equations and refuse what has no meaning."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from alpasim_plugin.block_fixers.sampling import (
+    context_level,
+    flow_step,
+    mixed_source,
+    opacity_mask,
+    opacity_values,
+    sample_block,
+    sources_needed,
+)
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.nets.schedule import from_names, interpolant, named, shifted, steps
+from tests.block_fixers.cache_history import history
+from tests.block_fixers.dit_cases import clip, furthest, network
+
+
+def noise(*shape, seed=0):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(("first", "frames", "latents"), [(True, 1, 1), (True, 5, 2), (True, 9, 3), (False, 4, 1), (False, 8, 2)])
+def test_mask_is_the_largest_opacity_of_each_latent(first, frames, latents):
+    opacity = torch.rand(2, 1, frames, 16, 24, generator=torch.Generator().manual_seed(1))
+    mask = opacity_mask(opacity, first)
+    assert mask.shape == (2, 1, latents, 2, 3)
+    for i in range(latents):
+        begin = (4 * i - 3 if i else 0) if first else 4 * i
+        end = (4 * i + 1) if first else 4 * i + 4
+        for row in range(2):
+            for column in range(3):
+                cell = opacity[:, 0, begin:end, 8 * row : 8 * row + 8, 8 * column : 8 * column + 8]
+                assert torch.equal(mask[:, 0, i, row, column], cell.amax((1, 2, 3)))
+
+
+def test_streamed_masks_are_the_whole_one():
+    opacity = torch.rand(1, 1, 13, 8, 8, generator=torch.Generator().manual_seed(2))
+    parts = [opacity_mask(opacity[:, :, :5]), opacity_mask(opacity[:, :, 5:], first=False)]
+    assert torch.equal(torch.cat(parts, 2), opacity_mask(opacity))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_opacity_values_are_means_of_four_by_four_pixels_of_every_frame(first):
+    opacity = torch.rand(2, 1, 5 if first else 8, 16, 24, generator=torch.Generator().manual_seed(1))
+    values = opacity_values(opacity, first)
+    assert values.shape == (2, 16, 2, 2, 3)
+    for channel in range(16):
+        frame, row, column = channel // 4, channel // 2 % 2, channel % 2
+        at = 1 + frame if first else 4 + frame  # of the second latent
+        cell = opacity[:, 0, at, 8 + 4 * row : 12 + 4 * row, 16 + 4 * column : 20 + 4 * column]
+        assert furthest(values[:, channel, 1, 1, 2], cell.mean((1, 2))) < 1e-6
+    if first:
+        assert torch.equal(values[:, 0:4, 0], values[:, 12:16, 0]), "the first frame stands for those before it"
+
+
+def test_opaque_render_is_kept_and_empty_one_is_noise_bit_for_bit():
+    z, eps = noise(1, 4, 2, 2, 3), noise(1, 4, 2, 2, 3, seed=1)
+    ones = opacity_mask(torch.ones(1, 1, 5, 16, 24))
+    assert torch.equal(mixed_source(z, ones, eps), z)
+    assert torch.equal(mixed_source(z, 0 * ones, eps), eps)
+    half = mixed_source(z, 0.25 * ones, eps)
+    assert furthest(half, 0.25 * z + 0.75 * eps) < 1e-7
+
+
+def test_opacity_that_is_not_a_number_is_refused_or_named():
+    opacity = torch.ones(1, 1, 5, 8, 16)
+    opacity[0, 0, 4, 3, 2] = torch.nan
+    with pytest.raises(InputError, match=r"1 of 640 values are NaN[\s\S]*nan_as"):
+        opacity_mask(opacity)
+    assert opacity_mask(opacity, nan_as=0.0).eq(1).all()
+    assert opacity_mask(torch.full_like(opacity, torch.nan), nan_as=0.0).eq(0).all()
+    assert opacity[0, 0, 4, 3, 2].isnan()
+
+
+def test_opacity_out_of_range_is_refused_and_rounding_is_clipped():
+    with pytest.raises(InputError, match="values from 1 to 255"):
+        opacity_mask(torch.tensor([1.0, 255.0]).repeat(1, 1, 1, 8, 4))
+    assert opacity_mask(torch.full((1, 1, 1, 8, 8), 1.0001)).max() == 1
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 4, 8, 8), (1, 1, 5, 9, 8), (1, 3, 5, 8, 8), (1, 5, 8, 8)])
+def test_opacity_of_a_wrong_shape_is_refused(shape):
+    with pytest.raises(InputError, match=r"1 \+ 4 n frames"):
+        opacity_mask(torch.ones(shape))
+
+
+def test_one_step_inverts_the_interpolant_at_every_time():
+    z_0, z_1 = noise(1, 4, 2, 2, 2), noise(1, 4, 2, 2, 2, seed=1)
+    for t in (0.0, 0.13, 0.8, 1.0):
+        assert furthest(flow_step(interpolant(z_0, z_1, t), z_1 - z_0, t), z_0) < 1e-6
+    assert torch.equal(interpolant(z_0, z_1, 1.0), z_1)
+    assert flow_step(z_1.bfloat16(), z_0.bfloat16()).dtype == torch.bfloat16
+
+
+def test_released_schedules():
+    assert [level.sigma for level in steps(4)] == pytest.approx([1.0, 0.9375, 0.83333, 0.625], abs=1e-5)
+    assert [level.sigma for level in steps(2)] == pytest.approx([1.0, 0.83333], abs=1e-5)
+    assert [(level.t, level.sigma) for level in steps(1)] == [(1000.0, 1.0)]
+    assert named(450).sigma == pytest.approx(0.8036, abs=1e-4)
+    assert named(100).sigma == pytest.approx(0.3571, abs=1e-4)
+    assert shifted(1.0) == 1.0
+
+
+def test_cache_write_is_told_128_and_noised_like_its_nearest_neighbour():
+    level = context_level()
+    assert level.t == 128.0
+    assert level.sigma == pytest.approx(0.12992832, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    "call", [lambda: steps(0), lambda: named(0), lambda: named(1001), lambda: from_names([]), lambda: from_names([500, 500])]
+)
+def test_senseless_schedules_are_refused(call):
+    with pytest.raises(InputError, match="choosing denoising steps"):
+        call()
+
+
+@pytest.mark.parametrize(("history", "forwards"), [("finalise", 3), ("last-forward", 2)])
+def test_history_decides_what_the_cache_keeps(history, forwards):
+    net, (_, _, text, hdmap) = network(), clip(2)
+    cache, calls = net.new_cache(1, 4, 6), []
+
+    class Counter:
+        def step(self, x, t, text, hdmap, cache, write, mask):
+            calls.append((round(t), write))
+            return net.step(x, t, text, hdmap, cache, write, mask)
+
+    sources = [noise(1, 4, 2, 4, 6, seed=i) for i in range(sources_needed(steps(2), history))]
+    z = sample_block(Counter(), sources, text, hdmap, cache, steps(2), history)
+    assert z.isfinite().all()
+    assert len(calls) == forwards
+    assert [write for _, write in calls] == [False] * (forwards - 1) + [True]
+    assert calls[-1][0] == (128 if history == "finalise" else 833)
+    assert cache.position == 2
+
+
+def test_one_step_is_equation_two_and_folding_changes_nothing():
+    net, (z_1, _, text, hdmap) = network(), clip(2)
+    one, two = (net.new_cache(1, 4, 6) for _ in range(2))
+    z_0 = sample_block(net, [z_1], text, hdmap, one, steps(1), "last-forward")
+    with torch.no_grad():
+        assert furthest(z_0, z_1 - net(z_1, 1000.0, text, hdmap)) < 1e-5
+    folded = sample_block(net.folded(1000.0), [z_1], text, hdmap, two, steps(1), "last-forward")
+    assert furthest(folded, z_0) < 1e-5
+    eps = noise(*z_1.shape)
+    args = (text, hdmap, two, steps(1), "finalise")
+    three = net.new_cache(1, 4, 6)
+    folded = sample_block(net.folded(1000.0), [z_1, eps], text, hdmap, three, steps(1), "finalise", finalise_net=net.folded(128.0))
+    two.reset()
+    assert furthest(folded, sample_block(net, [z_1, eps], *args)) < 1e-5
+    assert furthest(history(two, 1)[0], history(three, 1)[0]) < 1e-5
+
+
+@pytest.mark.parametrize("history", ["finalise", "last-forward"])
+def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(history):
+    net, (z_1, _, text, hdmap) = network(), clip(2)
+    eps = noise(*z_1.shape)
+    sources = [z_1, eps][: sources_needed(steps(1), history)]
+    kept, guessed = net.new_cache(1, 4, 6, window=4), net.new_cache(1, 4, 6, window=4)
+    for _ in range(4):
+        truth = sample_block(net, sources, text, hdmap, kept, steps(1), history)
+        sample_block(net, sources, text, hdmap + 1, guessed, steps(1), history, commit=False)
+        assert torch.equal(sample_block(net, sources, text, hdmap, guessed, steps(1), history, commit=False), truth)
+        guessed.commit()
+    assert guessed.position == kept.position == 8
+    assert torch.equal(guessed.keys, kept.keys)
+    with pytest.raises(InputError, match=r"latent 8[\s\S]*no forward to keep"):
+        guessed.commit()
+
+
+def test_given_latents_pass_through_untouched():
+    net, (z_1, _, text, hdmap) = network(), clip(2)
+    given = noise(1, 4, 1, 4, 6, seed=9)
+    seen = []
+
+    class Spy:
+        def step(self, x, t, text, hdmap, cache, write, mask):
+            seen.append((x[:, :, :1], mask))
+            return net.step(x, t, text, hdmap, cache, write, mask)
+
+    sources = [z_1, noise(*z_1.shape, seed=1), noise(*z_1.shape, seed=2)]
+    out = sample_block(Spy(), sources, text, hdmap, net.new_cache(1, 4, 6), steps(2), given=given)
+    assert torch.equal(out[:, :, :1], given)
+    assert len(seen) == 3
+    for x, mask in seen:
+        assert torch.equal(x, given)
+        assert mask[:, :, 0].eq(1).all()
+        assert mask[:, :, 1].eq(0).all()
+
+
+def test_wrong_number_of_noise_draws_is_refused():
+    net, (z_1, _, text, hdmap) = network(), clip(2)
+    with pytest.raises(InputError, match=r"1 sources for 1 steps[\s\S]*give 2: one per step, one for the cache write"):
+        sample_block(net, [z_1], text, hdmap, net.new_cache(1, 4, 6), steps(1))

@@ -1,0 +1,364 @@
+"""The Wan autoencoder on its own: streams, sizes, hard inputs, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
+from alpasim_plugin.block_fixers.wan_vae import WanVAE
+from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout, causal_conv, causal_conv3d, read_layout
+from alpasim_plugin.core.errors import InputError
+from tests.block_fixers.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
+from tests.examples import examples, first_of
+
+
+@pytest.fixture(scope="module")
+def vae() -> WanVAE:
+    return WanVAE.random(SMALL)
+
+
+def push_all(stream, x: Tensor, counts: list[int]) -> Tensor:
+    assert sum(counts) == x.shape[2]
+    return torch.cat([stream.push(part) for part in x.split(counts, dim=2)], dim=2)
+
+
+# Streams
+
+
+@pytest.mark.parametrize("counts", first_of([[1, 4, 4, 4], [5, 8], [5, 4, 4], [13], [1, 12], [9, 4]], 2))
+def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae: WanVAE, counts: list[int]) -> None:
+    video = clip(13, 16, 24, batch=2)
+    assert torch.equal(push_all(vae.encoder_stream(), video, counts), vae.encode(video))
+
+
+@pytest.mark.parametrize("counts", first_of([[1, 1, 1, 1, 1], [2, 2, 1], [5], [1, 4], [3, 2]], 2))
+def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae: WanVAE, counts: list[int]) -> None:
+    z = noise(2, 16, 5, 2, 3)
+    assert torch.equal(push_all(vae.decoder_stream(), z, counts), vae.decode(z))
+
+
+@pytest.mark.parametrize("layout", first_of([UNEVEN, SMALL]), ids=["uneven", "small"])
+def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(layout: WanLayout) -> None:
+    whole, steps = WanVAE.random(layout), WanVAE.random(layout)
+    whole.latents_per_pass = None
+    video, z = clip(13, 24, 16), noise(1, 16, 4, 3, 2)
+    torch.testing.assert_close(whole.encode(video), steps.encode(video), atol=1e-5, rtol=0)
+    torch.testing.assert_close(whole.decode(z, clamp=False), steps.decode(z, clamp=False), atol=1e-5, rtol=0)
+
+
+def test_frames_never_depend_on_later_ones(vae: WanVAE) -> None:
+    video = clip(13, 16, 16)
+    changed = video.clone()
+    changed[:, :, 5:] = 0.3
+    a, b = vae.encode(video), vae.encode(changed)
+    assert torch.equal(a[:, :, :2], b[:, :, :2])
+    assert not torch.equal(a[:, :, 2:], b[:, :, 2:])
+    assert torch.equal(vae.decode(a)[:, :, :5], vae.decode(b)[:, :, :5])
+
+
+def test_two_streams_interleaved_equal_each_alone(vae: WanVAE) -> None:
+    videos = [clip(9, 16, 16, seed=seed) for seed in (1, 2)]
+    streams = [vae.encoder_stream() for _ in videos]
+    mixed = [[stream.push(video[:, :, a:b]) for stream, video in zip(streams, videos, strict=True)] for a, b in ((0, 1), (1, 5), (5, 9))]
+    for video, parts in zip(videos, zip(*mixed, strict=True), strict=True):
+        assert torch.equal(torch.cat(parts, dim=2), vae.encode(video))
+
+
+def test_a_fork_and_a_rolled_back_stream_start_from_the_same_point(vae: WanVAE) -> None:
+    z = noise(1, 16, 3, 2, 2)
+    stream = vae.decoder_stream()
+    stream.push(z[:, :, :1])
+    fork, remembered = stream.fork(), stream.state
+    first = stream.push(z[:, :, 1:2])
+    stream.push(z[:, :, 2:])
+    stream.state = remembered
+    assert torch.equal(fork.push(z[:, :, 1:2]), first)
+    assert torch.equal(stream.push(z[:, :, 1:2]), first)
+
+
+def test_batch_entries_do_not_meet(vae: WanVAE) -> None:
+    video = clip(5, 16, 16, batch=2)
+    both = vae.encode(video)
+    torch.testing.assert_close(both[1:], vae.encode(video[1:]), atol=1e-5, rtol=0)
+
+
+def test_detached_streams_cut_gradients_and_whole_clips_do_not(vae: WanVAE) -> None:
+    z = noise(1, 16, 3, 2, 2).requires_grad_()
+    vae.decode(z, clamp=False)[:, :, -1].sum().backward()
+    assert z.grad is not None
+    assert z.grad[:, :, 1].abs().max() > 0
+    cut = z.detach().clone().requires_grad_()
+    push_all(vae.decoder_stream(), cut, [1, 1, 1])[:, :, -1].sum().backward()
+    assert cut.grad is not None
+    assert cut.grad[:, :, 2].abs().max() > 0
+    assert cut.grad[:, :, :2].abs().max() == 0
+
+
+@pytest.mark.slow
+def test_900_frames_stream_in_constant_memory_and_stay_finite(vae: WanVAE) -> None:
+    encoder, decoder = vae.encoder_stream(), vae.decoder_stream()
+    sizes = set()
+    with torch.inference_mode():
+        for step in range(226):
+            frames = clip(1 if step == 0 else 4, 32, 48, seed=step)
+            out = decoder.push(encoder.push(frames))
+            assert out.shape == frames.shape
+            assert out.isfinite().all()
+            held = [kept.untyped_storage().nbytes() for kept in (*(encoder.state or ()), *(decoder.state or ()))]
+            if step >= 2:
+                sizes.add(sum(held))
+    assert len(sizes) == 1
+
+
+def test_a_state_holds_no_more_than_its_own_frames(vae: WanVAE) -> None:
+    stream = vae.encoder_stream()
+    push_all(stream, clip(9, 32, 32), [5, 4])
+    assert stream.state is not None
+    assert len(stream.state) == 24
+    assert all(kept.untyped_storage().nbytes() == kept.numel() * kept.element_size() and kept.shape[1] <= 2 for kept in stream.state)
+
+
+# Sizes and hard inputs
+
+
+def test_one_and_five_frames_give_one_and_two_latents(vae: WanVAE) -> None:
+    one, five = vae.encode(clip(1, 16, 24)), vae.encode(clip(5, 16, 24))
+    assert one.shape == (1, 16, 1, 2, 3)
+    assert five.shape == (1, 16, 2, 2, 3)
+    assert vae.decode(one).shape == (1, 3, 1, 16, 24)
+    assert vae.decode(five).shape == (1, 3, 5, 16, 24)
+
+
+def test_six_frames_are_refused_with_both_ways_out(vae: WanVAE) -> None:
+    with pytest.raises(InputError) as error:
+        vae.encode(clip(6, 16, 16))
+    assert error.value.doing == "encoding video frames"
+    assert error.value.with_what == "6 frames at the start of a video"
+    assert "1 + 4k" in error.value.found
+    assert "give 5 or 9 frames (pad_clip" in error.value.do_this
+
+
+def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
+    video = clip(6, 18, 23)
+    padded, size = pad_clip(video)
+    assert padded.shape == (1, 3, 9, 24, 24)
+    assert torch.equal(padded[:, :, 6:], padded[:, :, 5:6].expand(-1, -1, 3, -1, -1))
+    assert torch.equal(crop_clip(padded, size), video)
+    assert crop_clip(vae.decode(vae.encode(padded)), size).shape == video.shape
+
+
+@pytest.mark.parametrize(("frames", "text"), [(5, "5 frames in the middle"), (1, "1 frames in the middle"), (0, "0 frames in the middle")])
+def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(vae: WanVAE, frames: int, text: str) -> None:
+    stream = vae.encoder_stream()
+    stream.push(clip(1, 16, 16))
+    before = stream.state
+    with pytest.raises(InputError, match=text):
+        stream.push(clip(frames, 16, 16))
+    assert stream.state is before
+
+
+@pytest.mark.parametrize(("height", "width", "good"), [(17, 24, "24 x 24"), (16, 30, "16 x 32"), (4, 8, "8 x 8")])
+def test_sides_that_are_no_multiple_of_eight_are_refused(vae: WanVAE, height: int, width: int, good: str) -> None:
+    with pytest.raises(InputError, match=f"pad to {good} "):
+        vae.encode(clip(1, height, width))
+
+
+def test_a_stream_whose_frame_size_changes_is_refused(vae: WanVAE) -> None:
+    stream = vae.encoder_stream()
+    stream.push(clip(1, 16, 16))
+    with pytest.raises(InputError, match="keep batch and frame size"):
+        stream.push(clip(4, 16, 24))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [torch.zeros(1, 3, 1, 16, 16, dtype=torch.uint8), torch.zeros(3, 1, 16, 16), torch.zeros(1, 4, 1, 16, 16)],
+    ids=["uint8", "4d", "rgba"],
+)
+def test_what_is_no_video_is_refused(vae: WanVAE, bad: Tensor) -> None:
+    with pytest.raises(InputError, match="not a floating-point video"):
+        vae.encode(bad)
+
+
+def test_latents_of_another_width_are_refused(vae: WanVAE) -> None:
+    with pytest.raises(InputError, match=r"give \(B, 16, t, h, w\)"):
+        vae.decode(torch.zeros(1, 8, 1, 2, 2))
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0, 1e4])
+def test_constant_and_saturated_clips_stay_finite(vae: WanVAE, value: float) -> None:
+    video = torch.full((1, 3, 9, 16, 16), value)
+    z = vae.encode(video)
+    out = vae.decode(z)
+    assert z.isfinite().all()
+    assert out.isfinite().all()
+    assert out.abs().max() <= 1
+
+
+def test_a_checkerboard_of_extremes_stays_finite(vae: WanVAE) -> None:
+    video = torch.ones(1, 3, 5, 16, 16)
+    video[..., ::2, 1::2] = video[..., 1::2, ::2] = -1
+    assert vae.decode(vae.encode(video)).isfinite().all()
+
+
+def test_one_bad_pixel_does_not_reach_earlier_frames(vae: WanVAE) -> None:
+    video = clip(9, 16, 16)
+    video[0, 0, 5, 3, 3] = torch.nan
+    z = vae.encode(video)
+    assert z[:, :, :2].isfinite().all()
+    assert z[:, :, 2].isnan().any()
+
+
+# Convolutions
+
+
+@settings(max_examples=examples(30), deadline=None)
+@given(past=st.integers(0, 2), frames=st.integers(1, 5), inputs=st.integers(1, 5), outputs=st.integers(1, 5), side=st.sampled_from([1, 3]))
+def test_summed_2d_convolutions_equal_the_3d_one(past: int, frames: int, inputs: int, outputs: int, side: int) -> None:
+    joined = noise(2, past + frames, 4, 5, inputs, seed=past)
+    weight, bias = noise(outputs, inputs, 3, side, side), noise(outputs)
+    expected = causal_conv3d(joined, weight, bias, frames)
+    torch.testing.assert_close(causal_conv(joined, weight, bias, frames), expected, atol=1e-5, rtol=1e-5)
+
+
+# Checkpoints
+
+
+@pytest.mark.parametrize("layout", [SMALL, UNEVEN, DEEPER], ids=["small", "uneven", "deeper"])
+def test_sizes_are_read_off_the_tensors(layout: WanLayout) -> None:
+    sd = WanVAE.random(layout).state_dict()
+    assert read_layout(sd) == layout
+    video = clip(5, 16, 16)
+    assert torch.equal(WanVAE.from_state_dict(sd).encode(video), WanVAE.random(layout).encode(video))
+
+
+@pytest.mark.parametrize(("base", "millions"), [(96, 126.9), (24, 8.04)])
+def test_published_widths_have_the_published_number_of_weights(base: int, millions: float) -> None:
+    with torch.device("meta"):
+        count = sum(p.numel() for p in WanVAE(WanLayout.of_base(base)).parameters())
+    assert count / 1e6 == pytest.approx(millions, abs=0.06)
+
+
+def test_the_keys_are_those_of_the_published_file(vae: WanVAE) -> None:
+    keys = set(vae.state_dict())
+    assert len(keys) == 194
+    assert {
+        "encoder.conv1.weight", "encoder.downsamples.3.shortcut.weight", "encoder.downsamples.5.time_conv.bias",
+        "encoder.middle.1.norm.gamma", "decoder.upsamples.4.shortcut.bias", "decoder.upsamples.11.resample.1.weight",
+        "decoder.head.2.bias", "conv1.weight", "conv2.bias",
+    } <= keys  # fmt: skip
+    assert not [key for key in keys if "stats" in key]
+
+
+def test_loading_copies_and_freezes(vae: WanVAE) -> None:
+    sd = vae.state_dict()
+    loaded = WanVAE.from_state_dict(sd)
+    assert not any(p.requires_grad for p in loaded.parameters())
+    assert loaded.conv1.weight.data_ptr() != sd["conv1.weight"].data_ptr()
+
+
+def test_outer_dictionaries_are_opened(vae: WanVAE) -> None:
+    assert torch.equal(WanVAE.from_state_dict({"state_dict": vae.state_dict()}).conv1.weight, vae.conv1.weight)
+
+
+@pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float64])
+def test_half_and_double_precision_tensors_load_into_single(vae: WanVAE, stored: torch.dtype) -> None:
+    sd = {key: value.to(stored) for key, value in vae.state_dict().items()}
+    loaded = WanVAE.from_state_dict(sd)
+    assert loaded.dtype == torch.float32
+    z = loaded.encode(clip(5, 16, 16))
+    assert z.dtype == torch.float32
+    assert (z - vae.encode(clip(5, 16, 16))).abs().max() < {torch.float16: 2e-3, torch.bfloat16: 2e-2, torch.float64: 1e-6}[stored]
+
+
+def test_one_half_precision_tensor_among_single_ones_loads(vae: WanVAE) -> None:
+    sd = dict(vae.state_dict())
+    sd["decoder.head.2.weight"] = sd["decoder.head.2.weight"].half()
+    assert {p.dtype for p in WanVAE.from_state_dict(sd).parameters()} == {torch.float32}
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_running_in_half_precision_stays_close(vae: WanVAE, dtype: torch.dtype) -> None:
+    half = WanVAE.from_state_dict(vae.state_dict(), dtype=dtype)
+    video = clip(9, 16, 16)
+    z = half.encode(video)
+    assert z.dtype == dtype
+    assert half.decode(z).dtype == dtype
+    assert (z.float() - vae.encode(video)).abs().max() < (0.05 if dtype == torch.bfloat16 else 0.01)
+    assert half.stats.mean.dtype == torch.float32
+
+
+Spoil = Callable[[dict[str, Tensor]], object]
+SPOILED: dict[str, tuple[Spoil, str]] = {
+    "missing bias": (lambda sd: sd.pop("encoder.middle.0.residual.2.bias"), "missing: encoder.middle.0.residual.2.bias"),
+    "missing width": (lambda sd: sd.pop("encoder.downsamples.6.residual.3.gamma"), "missing: encoder.downsamples.6.residual.3.gamma"),
+    "no halving": (
+        lambda sd: [sd.pop(key) for key in list(sd) if ".resample." in key],
+        "missing: encoder.downsamples.2.resample.1.weight",
+    ),
+    "missing block": (
+        lambda sd: [sd.pop(key) for key in list(sd) if key.startswith("decoder.upsamples.13.")],
+        "missing: decoder.upsamples.13.residual.0.gamma",
+    ),
+    "extra": (lambda sd: sd.update({"encoder.extra.weight": torch.zeros(1)}), "unexpected: encoder.extra.weight"),
+    "transposed": (
+        lambda sd: sd.update({"encoder.downsamples.3.residual.2.weight": sd["encoder.downsamples.3.residual.2.weight"].transpose(0, 1)}),
+        r"encoder.downsamples.3.residual.2.weight is \[8, 16, 3, 3, 3\] for \[16, 8, 3, 3, 3\], transposed",
+    ),
+    "transposed kernel": (
+        lambda sd: sd.update({"decoder.upsamples.3.time_conv.weight": sd["decoder.upsamples.3.time_conv.weight"].transpose(2, 4)}),
+        r"decoder.upsamples.3.time_conv.weight is \[64, 32, 1, 1, 3\] for \[64, 32, 3, 1, 1\], transposed",
+    ),
+    "wrong shape": (
+        lambda sd: sd.update({"conv2.weight": torch.zeros(16, 16)}),
+        r"wrong shape: conv2.weight is \[16, 16\] for \[16, 16, 1, 1, 1\]",
+    ),
+    "integers": (lambda sd: sd.update({"conv2.bias": torch.zeros(16, dtype=torch.int64)}), "not floating point: conv2.bias"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_a_spoiled_checkpoint_is_named_in_four_parts(vae: WanVAE, name: str) -> None:
+    spoil, text = SPOILED[name]
+    sd = dict(vae.state_dict())
+    spoil(sd)
+    with pytest.raises(InputError, match=text) as error:
+        WanVAE.from_state_dict(sd, source="weights.safetensors")
+    assert error.value.doing == "loading Wan VAE weights"
+    assert "weights.safetensors" in error.value.with_what
+    assert "LightVAE" in error.value.do_this
+
+
+def test_many_faults_are_listed_in_one_error(vae: WanVAE) -> None:
+    sd = {key: value for key, value in vae.state_dict().items() if not key.startswith("decoder.middle.")}
+    sd["stray"] = torch.zeros(1)
+    with pytest.raises(InputError, match=r"missing: decoder.middle.0.residual.0.gamma.* and 9 more; unexpected: stray"):
+        WanVAE.from_state_dict(sd)
+
+
+def test_statistics_of_another_length_are_refused(vae: WanVAE) -> None:
+    with pytest.raises(InputError, match="16 latent channels, 3 latent means"):
+        WanVAE.from_state_dict(vae.state_dict(), mean=[0.0] * 3, std=[1.0] * 3)
+
+
+def test_a_deep_copy_is_independent(vae: WanVAE) -> None:
+    other = copy.deepcopy(vae)
+    other.conv1.weight.zero_()
+    assert vae.conv1.weight.abs().max() > 0
+
+
+@pytest.mark.slow
+def test_the_published_size_runs_on_the_accelerator_path_without_memory() -> None:
+    with torch.device("meta"):
+        full = WanVAE(WanLayout.of_base(96)).to(torch.bfloat16)
+        z = full.encode(torch.empty(1, 3, 13, 544, 960))
+        assert z.shape == (1, 16, 4, 68, 120)
+        assert z.dtype == torch.bfloat16
+        assert full.decode(z).shape == (1, 3, 13, 544, 960)

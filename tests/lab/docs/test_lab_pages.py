@@ -1,0 +1,54 @@
+"""The laboratory's pages, what leads to them from the other pages, and the commands of its verbs on all of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import verbs
+from tests.docs import test_pages as core
+from tests.docs.commands import LAB, LAB_VERBS, commands, lab_pages, pages
+from tests.docs.test_commands import needing_the_checkout, not_understood
+
+
+@pytest.fixture
+def everywhere(repo: Path) -> list[Path]:
+    return [repo / "CHANGELOG.md", *pages(repo), *lab_pages(repo)]
+
+
+def test_links_to_and_from_the_pages_resolve(repo: Path, everywhere: list[Path]) -> None:
+    assert core.broken_links(repo, everywhere, to_lab=True) == []
+    assert core.broken_links(repo, lab_pages(repo), to_lab=False) == []
+
+
+def test_pages_that_code_and_pages_name_exist(repo: Path, everywhere: list[Path]) -> None:
+    folders = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "tests", "docs")
+    code = [path for folder in folders for suffix in ("py", "yaml") for path in (repo / folder).rglob(f"*.{suffix}")]
+    named = [(file, page) for file in (*code, *everywhere) for page in core.MENTION.findall(file.read_text(encoding="utf-8"))]
+    assert [f"{file.relative_to(repo)}: {page}" for file, page in named if page.startswith(LAB) and not (repo / page).is_file()] == []
+
+
+def test_pages_are_short_and_reachable_and_their_pictures_shown(repo: Path) -> None:
+    assert core.too_long(repo, lab_pages(repo)) == {}
+    assert [page.name for page in lab_pages(repo) if page not in core.reachable(repo / "docs")] == []
+    assert core.unshown(repo / LAB, lab_pages(repo)) == []
+
+
+def test_files_and_modules_that_pages_name_exist(repo: Path, everywhere: list[Path]) -> None:
+    assert core.files_not_there(repo, everywhere) == []
+    assert core.imports_of_nothing(repo, everywhere) == []
+
+
+def test_every_command_is_understood_and_needs_no_checkout(repo: Path) -> None:
+    every = commands(repo, [*pages(repo), *lab_pages(repo)])
+    assert not_understood([one for one in every if one.is_of_lab or one.page.startswith(LAB)]) == []
+    assert sum(one.is_of_lab for one in every) > 20
+    assert needing_the_checkout(lab_pages(repo)) == []
+
+
+def test_every_verb_of_the_laboratory_is_there_and_on_a_page(repo: Path) -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in lab_pages(repo))
+    assert {verb for verb, where in verbs().items() if ".lab." in where} == set(LAB_VERBS)
+    assert [verb for verb in LAB_VERBS if not re.search(rf"simrun {verb}\b", text)] == []
