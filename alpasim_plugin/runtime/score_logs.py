@@ -241,6 +241,7 @@ def exit_code(scores: Sequence[LogScore], failures_allowed: bool, aggregate_erro
 
 FINDING = "finding the scene of a log"
 _SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")  # a seed other than the file's is part of the id
+MOST_SEEDED = 256
 
 
 class KnownScenes:
@@ -259,6 +260,8 @@ class KnownScenes:
         self._archives: dict[str, Path] = {}
         self._others: list[str] = []
         self._read: dict[str, LoggedScene] = {}
+        self._own: dict[str, str] = {}  # file -> id of its scene
+        self._seeded: list[str] = []  # of other seeds, oldest first: whoever asks may name any number of them
         for place in self.places:
             for path in _scene_files(place):
                 if Path(path).suffix == ".usdz":
@@ -274,16 +277,8 @@ class KnownScenes:
         """
         if scene_id not in self._read and scene_id in self._archives:
             self._read[scene_id] = _from_archive(self._archives[scene_id], self._rails)
-        seeded = _SEEDED.fullmatch(scene_id)
-        for path in list(self._others) if scene_id not in self._read else []:
-            found = _from_scenario(load_scenario(path))
-            if seeded and found.scene.scene_id == seeded["own"]:
-                found = _from_scenario(load_scenario(path, int(seeded["seed"])))
-            else:
-                self._others.remove(path)
-            self._read[found.scene.scene_id] = found
-            if found.scene.scene_id == scene_id:
-                break
+        elif scene_id not in self._read:
+            self._search(scene_id)
         if scene_id not in self._read:
             known = sorted({*self._archives, *self._read})
             raise InputError(
@@ -291,6 +286,24 @@ class KnownScenes:
                 "name the log's scene with --scene, or a folder that holds it",
             )  # fmt: skip
         return self._read[scene_id]
+
+    def _search(self, scene_id: str) -> None:
+        """Read scenario files until one has the id, or the id of another seed of it."""
+        seeded = _SEEDED.fullmatch(scene_id)
+        for path in self._others:
+            if path not in self._own:
+                found = _from_scenario(load_scenario(path))
+                self._own[path] = found.scene.scene_id
+                self._read[found.scene.scene_id] = found
+            if seeded and self._own[path] == seeded["own"]:
+                found = _from_scenario(load_scenario(path, int(seeded["seed"])))
+                if found.scene.scene_id not in self._read:  # seed007 and seed7 are one scene
+                    self._seeded.append(found.scene.scene_id)
+                self._read[found.scene.scene_id] = found
+            if scene_id in self._read:
+                break
+        while len(self._seeded) > MOST_SEEDED:
+            del self._read[self._seeded.pop(0)]
 
     def _add_archive(self, path: Path) -> None:
         scene_id = usdz_scene_id(path)
