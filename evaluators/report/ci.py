@@ -84,9 +84,9 @@ def summary_md(run: Run) -> str:
         head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
         body = []
         for failure in failures:
-            r = failure.rollout
+            one = failure.rollout
             what = "; ".join(f"{label}: {text}" for label, text in failure.parts)
-            body.append([r.failure_class, r.renderer, r.policy, r.scene, str(r.seed), what])
+            body.append([one.failure_class, one.renderer, one.policy, one.scene, str(one.seed), what])
         parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
     command = provenance(run).command
     parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")

@@ -186,13 +186,14 @@ def assemble(settings: Settings) -> Assembled:
     scenes = None
     if settings.scenes:
         scenes = SceneCache(settings.scenes, own, needs_map, settings.device, settings.threads, kept=settings.kept_scenes)
-    channel = None if settings.upstream is None else settings.upstream.channel()
-    stub = None if channel is None else Stub(channel, "SensorsimService")
+    channel = stub = None
     source: FrameSource
-    if stub is None:
+    if settings.upstream is None:
         assert scenes is not None
         source = LocalSource(scenes, busy, settings.threads)
     else:
+        channel = settings.upstream.channel()
+        stub = Stub(channel, "SensorsimService")
         masks = read_masks(settings.masks)
         source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads)
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)

@@ -181,8 +181,10 @@ class Driving:
             if new:
                 check_time(new[-1].timestamp_us, "submit_egomotion_observation")
                 xyz, quat = read_poses((pose.pose for pose in new), "the ego's motion")
-                pairs = (known.t_us, t_us), (known.xyz, xyz), (known.quat, quat)
-                self._history = Trajectory(*(np.concatenate(pair)[-MOST_POSES:] for pair in pairs))
+                times = np.concatenate((known.t_us, t_us))[-MOST_POSES:]
+                places = np.concatenate((known.xyz, xyz))[-MOST_POSES:]
+                turns = np.concatenate((known.quat, quat))[-MOST_POSES:]
+                self._history = Trajectory(times, places, turns)
             if message.dynamic_states:
                 self._state = message.dynamic_states[-1]
 
