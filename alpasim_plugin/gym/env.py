@@ -20,7 +20,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.plan_check import plan_problem
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.core.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec, Trajectory, Vehicle
-from alpasim_plugin.gym.reward import Instant, Judge, Reward
+from alpasim_plugin.gym.reward import Instant, Reward, Scorer
 from alpasim_plugin.plugins.interfaces import Controller
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.cell import make_renderer
@@ -180,7 +180,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._folder: TemporaryDirectory[str] | None = None
         self._recorder: _Watching | None = None
         self._loop: Loop | None = None
-        self._judge: Judge | None = None
+        self._judge: Scorer | None = None
         self._observation: Observation | None = None
 
     @property
@@ -213,7 +213,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._recorder = _Watching(self._scenario, rollout_seed, Path(self._folder.name))
         session = make_renderer(self._renderer, self._scenario, rollout_seed, threads=1)
         self._loop = Loop(self._scenario, session, self._sensors, self._actions.controller, self._recorder)
-        self._judge = Judge(self._scenario, self._preset, self._reward)
+        self._judge = Scorer(self._scenario, self._preset, self._reward)
         self._driving = self._loop.drive()
         self._observation = next(self._driving)
         while self._observation.t_us < self._scenario.start_us + self._scenario.warmup_us:  # the recording is forced: nothing to decide

@@ -36,7 +36,7 @@ class Reward:
     offroad: float = 5.0
 
 
-class Judge:
+class Scorer:
     """Judges the steps of one episode.
 
     Args:
@@ -57,7 +57,7 @@ class Judge:
         self._before: Instant | None = None
 
     def judge(self, instants: Sequence[Instant]) -> tuple[float, str, dict[str, float]]:
-        """Judge what happened since the last call.
+        """Score what happened since the last call.
 
         Args:
             instants: Every control instant since then, in order.

@@ -1,4 +1,4 @@
-"""Contact: hand-made situations, and the array search against the exact step-by-step twin on hard ones."""
+"""Contact: hand-made situations, and the array search against the exact step-by-step reference on hard ones."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ def test_the_rollout_value_is_the_least_margin_of_the_scored_steps_and_off_road_
     assert values["offroad"].value == 1.0
 
 
-# --- twin -------------------------------------------------------------------------------------------------------------
+# --- reference ------------------------------------------------------------------------------------------------------------
 
 COORDINATE = st.one_of(st.integers(-8, 8).map(float), st.floats(-8, 8))
 

@@ -1,4 +1,4 @@
-"""The laboratory's readers, for the fuzzer of `tests.fuzz`, and an input that once gave way."""
+"""The laboratory's readers, for the fuzzer of `tests.fuzz`, and an input that once failed."""
 
 from __future__ import annotations
 

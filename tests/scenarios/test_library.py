@@ -28,7 +28,7 @@ def scenario(name: str) -> Scenario:
 
 
 def rectangle(pose: F64, box: Box, ahead_m: float = 0.0) -> shapely.Polygon:
-    """One footprint by plain trigonometry: the slow twin of the array code in `scenarios.build`."""
+    """One footprint by plain trigonometry: the slow reference of the array code in `scenarios.build`."""
     yaw = yaw_of(pose)
     centre = pose[:2, 3] + ahead_m * np.array([np.cos(yaw), np.sin(yaw)])
     along, aside = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])

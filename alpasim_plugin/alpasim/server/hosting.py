@@ -187,7 +187,7 @@ class Host:
         every: Called every `UPKEEP_S` seconds, such as to forget what is old.
 
     Raises:
-        InputError: An address that is none, or files of the policy that cannot be read.
+        InputError: An invalid address, or files of the policy that cannot be read.
         InfrastructureError: The port cannot be had.
     """
 

@@ -21,7 +21,7 @@ from alpasim_plugin.plugins.parts import resolve
 
 DOING = "measuring quality against training time"
 SPLIT = "val"
-CLIPS = 12  # by an exact test of 8 no metric of whole sets could refute a claim of nine contests
+CLIPS = 12  # by an exact test of 8 no metric of whole sets could refute a claim of nine comparisons
 FRAMES = 93  # the paper's clips are the length of its training clips
 ARMS = (OURS, *DISTILLED)
 

@@ -130,7 +130,7 @@ def paper(
         console.print(f"cost: {found.cost.about}", highlight=False)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
     verdicts = [
-        {"number": one.claim.number, "verdict": one.verdict, "contests": [asdict(result) for result in one.results]} for one in judged
+        {"number": one.claim.number, "verdict": one.verdict, "comparisons": [asdict(result) for result in one.results]} for one in judged
     ]
     write_json(out / "paper.json", {**facts, "claims": verdicts})
     if found.shown:

@@ -1,4 +1,4 @@
-"""The paper's claims as contests between arms: what must be better than what, on which metric, under which protocol.
+"""The paper's claims as comparisons between arms: what must be better than what, on which metric, under which protocol.
 
 The list is that of the paper's text and tables, in the words of our metrics. A metric that the paper measures with networks of others
 is replaced by ours (`published`), so a claim is tested in the form that can be tested here.
@@ -30,7 +30,7 @@ DRIVERS = ("learned", "lane-camera")  # policies that drive behind the arms; the
 
 
 @dataclass(frozen=True)
-class Contest:
+class Comparison:
     """One comparison.
 
     Args:
@@ -64,13 +64,13 @@ class Claim:
         number: In the order of the paper.
         text: The claim.
         where: Table or figure.
-        contests: All must come out for the claim to hold.
+        comparisons: All must come out for the claim to hold.
     """
 
     number: int
     text: str
     where: str
-    contests: tuple[Contest, ...]
+    comparisons: tuple[Comparison, ...]
 
 
 def behind(policy: str) -> str:
@@ -83,9 +83,9 @@ def within(arm: str) -> str:
     return f"{OURS}, half of {arm}'s core-minutes"
 
 
-def each(protocol: str, metrics: Sequence[str], first: str, rivals: Sequence[str], relation: Relation = "better") -> tuple[Contest, ...]:
-    """Return the contests of an arm with every rival on every metric."""
-    return tuple(Contest(protocol, metric, first, rival, relation) for metric in metrics for rival in rivals)
+def each(protocol: str, metrics: Sequence[str], first: str, rivals: Sequence[str], relation: Relation = "better") -> tuple[Comparison, ...]:
+    """Return the comparisons of an arm with every rival on every metric."""
+    return tuple(Comparison(protocol, metric, first, rival, relation) for metric in metrics for rival in rivals)
 
 
 CLAIMS: tuple[Claim, ...] = (
@@ -99,7 +99,7 @@ CLAIMS: tuple[Claim, ...] = (
     Claim(
         2, "Distilled arms have the best PSNR and SSIM, and worse LPIPS, DISTS, FVD and FVMD than OneFixer", "Table 1, Waymo",
         (
-            *(contest for arm in DISTILLED for contest in each("cycle", (PSNR, SSIM), arm, (OURS,))),
+            *(comparison for arm in DISTILLED for comparison in each("cycle", (PSNR, SSIM), arm, (OURS,))),
             *each("cycle", (PERCEPTUAL, FD, MOTION), OURS, DISTILLED),
         ),
     ),
@@ -115,20 +115,20 @@ CLAIMS: tuple[Claim, ...] = (
         (
             *each("cycle", (PERCEPTUAL, FD, MOTION), "omnidreams@4", ("omnidreams@1",)),
             *each("under-trained", (PERCEPTUAL, FD, MOTION), "omnidreams@4", ("omnidreams@1",)),
-            Contest("under-trained", WARP, "omnidreams@1", "omnidreams@4"),
+            Comparison("under-trained", WARP, "omnidreams@1", "omnidreams@4"),
         ),
     ),
     Claim(
         5, "Distillation improves ArtiFixer at one step (FVD 13.3 to 8.46); before it, four steps stay better (6.88)", "Table 1, Waymo",
-        (Contest("cycle", FD, "artifixer", "artifixer-pre@1"), Contest("cycle", FD, "artifixer-pre@4", "artifixer")),
+        (Comparison("cycle", FD, "artifixer", "artifixer-pre@1"), Comparison("cycle", FD, "artifixer-pre@4", "artifixer")),
     ),
     Claim(
         6, "Own history (V2) moves better than clean history (V1) but stays perceptually worse; LPIPS alone (V3) is as close but moves "
         "worse; V9 is the best balance", "Table 2a",
         (
-            Contest("cycle", MOTION, "V2", "V1"),
-            Contest("cycle", PERCEPTUAL, "V3", "V2"),
-            Contest("cycle", MOTION, OURS, "V3"),
+            Comparison("cycle", MOTION, "V2", "V1"),
+            Comparison("cycle", PERCEPTUAL, "V3", "V2"),
+            Comparison("cycle", MOTION, OURS, "V3"),
             *each("cycle", (FD,), OURS, ("V1", "V2", "V3")),
         ),
     ),
@@ -137,9 +137,9 @@ CLAIMS: tuple[Claim, ...] = (
         "have worse FVD and FVMD", "Table 2a",
         (
             *each("cycle", (FD, PERCEPTUAL), "3dgs", ("V6",)),
-            *(Contest("cycle", PERCEPTUAL, joint, "V8") for joint in ("V4", "V5", OURS)),
+            *(Comparison("cycle", PERCEPTUAL, joint, "V8") for joint in ("V4", "V5", OURS)),
             *each("cycle", (FD, MOTION), OURS, ("V7", "V4")),
-            Contest("cycle", PERCEPTUAL, OURS, "V4", "close"),
+            Comparison("cycle", PERCEPTUAL, OURS, "V4", "close"),
         ),
     ),
     Claim(
@@ -150,17 +150,17 @@ CLAIMS: tuple[Claim, ...] = (
         9, "In closed loop DiFix collides more than the raw render and leaves the road less; arms of the same backbone stay near the raw "
         "render", "Table 2b",
         (
-            *(Contest(behind(policy), "collision_at_fault", "3dgs", "difix") for policy in DRIVERS),
-            *(Contest(behind(policy), "offroad", "difix", "3dgs") for policy in DRIVERS),
+            *(Comparison(behind(policy), "collision_at_fault", "3dgs", "difix") for policy in DRIVERS),
+            *(Comparison(behind(policy), "offroad", "difix", "3dgs") for policy in DRIVERS),
             *(
-                Contest(behind(policy), "collision_at_fault", arm, "3dgs", "close")
+                Comparison(behind(policy), "collision_at_fault", arm, "3dgs", "close")
                 for policy in DRIVERS for arm in ("omnidreams@4", "self-forcing")
             ),
         ),
     ),
     Claim(
         10, "Over 900 frames distilled arms are close to OmniDreams at one step", "Table 1, Seoul",
-        tuple(contest for arm in DISTILLED for contest in each("under-trained", (PERCEPTUAL, PSNR), arm, ("omnidreams@1",), "close")),
+        tuple(comparison for arm in DISTILLED for comparison in each("under-trained", (PERCEPTUAL, PSNR), arm, ("omnidreams@1",), "close")),
     ),
     Claim(
         11, "OneFixer takes far less time a frame than video fixers; with a shifted map its lanes and vehicles stay better than with none; "
@@ -170,14 +170,14 @@ CLAIMS: tuple[Claim, ...] = (
             *each("cycle", (MS,), OURS, ("3dgs-enhancer@8", "omnidreams@4", "artifixer-pre@4")),
             *each("map-error", (LANE,), "V9, lanes 0.50 m aside", ("V5",)),
             *each("map-error", (CUBOID,), "V9, boxes 0.35 m aside", ("V5",)),
-            *(Contest("cost", FD_16, within(arm), arm) for arm in DISTILLED),
-            *(Contest("cost", MOTION, arm, within(arm), "not better") for arm in DISTILLED),
+            *(Comparison("cost", FD_16, within(arm), arm) for arm in DISTILLED),
+            *(Comparison("cost", MOTION, arm, within(arm), "not better") for arm in DISTILLED),
         ),
     ),
     Claim(
         12, "A temporal Harmonizer that was trained on clean frames drifts on its own outputs; one trained on its own outputs does not",
         "drift figure",
-        (Contest("cycle", DRIFT, "harmonizer-temporal", "harmonizer-temporal-teacher"),),
+        (Comparison("cycle", DRIFT, "harmonizer-temporal", "harmonizer-temporal-teacher"),),
     ),
     Claim(
         13, "Beyond driving and after fine-tuning OneFixer is best on PSNR, LPIPS in the middle and at the end, and FVMD; ArtiFixer is "
@@ -191,8 +191,8 @@ CLAIMS: tuple[Claim, ...] = (
         14, "Asked for night, fog or snow, OneFixer renders the style and keeps lanes better than editing systems; here: the style in nine "
         "frames of ten, lanes not below the raw render's by the formula (editing systems cannot be run here)", "appearance table",
         (
-            *(Contest("appearance", metric, "appearance", "0.9", bound=0.9) for metric in (STYLE_ACC, of_seed(STYLE_ACC, 1))),
-            *(Contest("appearance", metric, "3dgs + formula", "appearance", "not better") for metric in (LANE, of_seed(LANE, 1))),
+            *(Comparison("appearance", metric, "appearance", "0.9", bound=0.9) for metric in (STYLE_ACC, of_seed(STYLE_ACC, 1))),
+            *(Comparison("appearance", metric, "3dgs + formula", "appearance", "not better") for metric in (LANE, of_seed(LANE, 1))),
         ),
     ),
 )  # fmt: skip

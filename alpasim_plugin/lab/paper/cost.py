@@ -156,17 +156,17 @@ def _halves(cost: Cost) -> str:
 
 
 def _by_seed(cost: Cost) -> str:
-    """Return the claims' contests of training time in every seed; empty where there is one seed."""
+    """Return the claims' comparisons of training time in every seed; empty where there is one seed."""
     if len(cost.seeds) == 1:
         return ""
-    contests = [contest for claim in CLAIMS for contest in claim.contests if contest.protocol == "cost"]
-    found = [contest_results(contests, {"cost": contested(cost, seed)}) for seed in cost.seeds]
+    comparisons = [comparison for claim in CLAIMS for comparison in claim.comparisons if comparison.protocol == "cost"]
+    found = [contest_results(comparisons, {"cost": contested(cost, seed)}) for seed in cost.seeds]
     rows = []
-    for i, contest in enumerate(contests):
+    for i, comparison in enumerate(comparisons):
         results = [each[i] for each in found]
         cells = [r.missing if r.difference is None else f"{difference_text(r.difference)}: {r.outcome}" for r in results]
-        rows.append([f"`{contest.metric}`: {contest.first} minus {contest.second}", *cells])
-    return f"\n{BY_SEED}\n\n" + markdown_table(["contest", *(f"seed {seed}" for seed in cost.seeds)], rows)
+        rows.append([f"`{comparison.metric}`: {comparison.first} minus {comparison.second}", *cells])
+    return f"\n{BY_SEED}\n\n" + markdown_table(["comparison", *(f"seed {seed}" for seed in cost.seeds)], rows)
 
 
 def _minutes(value: float) -> str:

@@ -83,14 +83,14 @@ def difference_text(found: Difference) -> str:
 
 
 def verdicts(judged: Sequence[Judged], reasons: Mapping[int, str]) -> str:
-    """Return a line for every claim, and below it a paragraph for each that does not hold: which contests, and why.
+    """Return a line for every claim, and below it a paragraph for each that does not hold: which comparisons, and why.
 
     Args:
         judged: All claims.
         reasons: Number of a claim -> why it comes out as it does here, written by whoever looked; nothing is made up for the others.
     """
     rows = [[str(one.claim.number), one.claim.text, one.claim.where, f"**{one.verdict}**", _tally(one)] for one in judged]
-    out = [markdown_table(["", "claim", "where", "verdict", "contests"], rows)]
+    out = [markdown_table(["", "claim", "where", "verdict", "comparisons"], rows)]
     for one in judged:
         if one.verdict == "not measured":
             missing = sorted({result.missing for result in one.results if result.missing})
@@ -115,10 +115,11 @@ def _tally(one: Judged) -> str:
 
 
 def _sentence(result: Result) -> str:
-    contest = result.contest
+    comparison = result.comparison
     assert result.difference is not None
     corrected = f", corrected p {result.refutes:.2g}" if result.outcome == "against" and result.refutes is not None else ""
-    return f"{contest.protocol}, `{contest.metric}`: {contest.first} minus {contest.second} {difference_text(result.difference)}{corrected}"
+    arms = f"{comparison.first} minus {comparison.second}"
+    return f"{comparison.protocol}, `{comparison.metric}`: {arms} {difference_text(result.difference)}{corrected}"
 
 
 def _refuting(result: Result) -> float:

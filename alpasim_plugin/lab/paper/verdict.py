@@ -1,4 +1,4 @@
-"""Whether each of the paper's claims holds here: every contest with its paired interval, and one word for the claim."""
+"""Whether each of the paper's claims holds here: every comparison with its paired interval, and one word for the claim."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from alpasim_plugin.lab.paper.claims import CLAIMS, CLOSE, Claim, Contest
+from alpasim_plugin.lab.paper.claims import CLAIMS, CLOSE, Claim, Comparison
 from alpasim_plugin.lab.paper.measured import ALPHA, Difference, Measured, beyond
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from evaluators.statistics.intervals import Interval
@@ -17,17 +17,17 @@ Verdict = Literal["holds", "does not hold", "undecided at our scale", "not measu
 
 @dataclass(frozen=True)
 class Result:
-    """A contest with its outcome.
+    """A comparison with its outcome.
 
     Args:
-        contest: Which.
+        comparison: Which.
         outcome: By its own 95 % interval or p-value.
         difference: None where it was not measured.
         missing: What was not measured.
-        refutes: One-sided p-value that it goes against the claim, corrected by Holm for all contests of the claim; None: not measured.
+        refutes: One-sided p-value that it goes against the claim, corrected by Holm for all comparisons of the claim; None: not measured.
     """
 
-    contest: Contest
+    comparison: Comparison
     outcome: Outcome
     difference: Difference | None
     missing: str = ""
@@ -36,14 +36,14 @@ class Result:
 
 @dataclass(frozen=True)
 class Judged:
-    """A claim with its verdict and the results of all of its contests."""
+    """A claim with its verdict and the results of all of its comparisons."""
 
     claim: Claim
     verdict: Verdict
     results: tuple[Result, ...]
 
     def count(self, outcome: Outcome) -> int:
-        """Return how many contests came out so."""
+        """Return how many comparisons came out so."""
         return sum(result.outcome == outcome for result in self.results)
 
 
@@ -55,9 +55,9 @@ def judge_claims(measured: Mapping[str, Measured], claims: Sequence[Claim] = CLA
         claims: Those of the paper.
 
     Returns:
-        A verdict each: ``does not hold`` where one contest is decided against it, corrected for the claim's number of contests; else ``not
-        measured`` where one was not measured, else ``holds`` where all are decided for it, else ``undecided at our scale``. A claim that
-        needs all of its contests needs no correction to hold (intersection-union test).
+        A verdict each: ``does not hold`` where one comparison is decided against it, corrected for the claim's number of comparisons; else
+        ``not measured`` where one was not measured, else ``holds`` where all are decided for it, else ``undecided at our scale``. A claim
+        that needs all of its comparisons needs no correction to hold (intersection-union test).
     """
     return tuple(_judged(claim, measured) for claim in claims)
 
@@ -70,19 +70,19 @@ def in_both(first: Verdict, second: Verdict) -> Verdict:
     return "holds"
 
 
-def contest_results(contests: Sequence[Contest], measured: Mapping[str, Measured]) -> list[Result]:
-    """Return every contest with its outcome, uncorrected for their number.
+def contest_results(comparisons: Sequence[Comparison], measured: Mapping[str, Measured]) -> list[Result]:
+    """Return every comparison with its outcome, uncorrected for their number.
 
     Args:
-        contests: In any order.
+        comparisons: In any order.
         measured: PROTOCOL -> what was measured under it.
     """
-    return [_result(contest, measured.get(contest.protocol)) for contest in contests]
+    return [_result(comparison, measured.get(comparison.protocol)) for comparison in comparisons]
 
 
 def _judged(claim: Claim, measured: Mapping[str, Measured]) -> Judged:
-    found = contest_results(claim.contests, measured)
-    against = [None if r.difference is None else _p_against(r.contest, r.difference, measured[r.contest.protocol]) for r in found]
+    found = contest_results(claim.comparisons, measured)
+    against = [None if r.difference is None else _p_against(r.comparison, r.difference, measured[r.comparison.protocol]) for r in found]
     results = tuple(replace(result, refutes=p) for result, p in zip(found, holm(against), strict=True))
     outcomes = {result.outcome for result in results}
     verdict: Verdict = "undecided at our scale"
@@ -113,42 +113,42 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return out
 
 
-def _p_against(contest: Contest, found: Difference, measured: Measured) -> float | None:
-    """Return the one-sided p-value that a contest goes against its claim."""
+def _p_against(comparison: Comparison, found: Difference, measured: Measured) -> float | None:
+    """Return the one-sided p-value that a comparison goes against its claim."""
     p_value, toward = found.p_value, found.difference * {"higher": 1, "lower": -1}.get(KNOWN.info(found.metric).direction, 0)
-    if contest.relation == "close" and found.low is not None and found.high is not None:
-        width = CLOSE * abs(measured.mean(contest.second, contest.metric).centre)
+    if comparison.relation == "close" and found.low is not None and found.high is not None:
+        width = CLOSE * abs(measured.mean(comparison.second, comparison.metric).centre)
         p_value = beyond(Interval(found.difference, found.low, found.high), width, found.n)
         return None if p_value is None else p_value / 2
     if p_value is None:
         return None
-    is_against = toward > 0 if contest.relation == "not better" else toward < 0
+    is_against = toward > 0 if comparison.relation == "not better" else toward < 0
     return p_value / 2 if is_against else 1 - p_value / 2
 
 
-def _result(contest: Contest, measured: Measured | None) -> Result:
+def _result(comparison: Comparison, measured: Measured | None) -> Result:
     if measured is None:
-        return Result(contest, "not measured", None, f"protocol {contest.protocol}")
-    for arm in contest.arms:
-        if not measured.has(arm, contest.metric):
-            missing = f"{contest.metric} of {arm}" if arm in measured.values else f"arm {arm}"
-            return Result(contest, "not measured", None, missing)
-    if contest.bound is None:
-        found = measured.difference(contest.metric, contest.first, contest.second)
+        return Result(comparison, "not measured", None, f"protocol {comparison.protocol}")
+    for arm in comparison.arms:
+        if not measured.has(arm, comparison.metric):
+            missing = f"{comparison.metric} of {arm}" if arm in measured.values else f"arm {arm}"
+            return Result(comparison, "not measured", None, missing)
+    if comparison.bound is None:
+        found = measured.difference(comparison.metric, comparison.first, comparison.second)
     else:
-        found = measured.margin(contest.metric, contest.first, contest.bound)
-    return Result(contest, _outcome(contest, found, measured), found)
+        found = measured.margin(comparison.metric, comparison.first, comparison.bound)
+    return Result(comparison, _outcome(comparison, found, measured), found)
 
 
-def _outcome(contest: Contest, found: Difference, measured: Measured) -> Outcome:
-    if contest.relation == "better":
+def _outcome(comparison: Comparison, found: Difference, measured: Measured) -> Outcome:
+    if comparison.relation == "better":
         return "for" if found.favours > 0 else "against" if found.favours < 0 else "open"
-    if contest.relation == "not better":
+    if comparison.relation == "not better":
         # Shown better refutes it; shown worse, or no better within what can be seen, is what it says.
         return "against" if found.favours > 0 else "for"
     if found.low is None or found.high is None:
         return "open"
-    width = CLOSE * abs(measured.mean(contest.second, contest.metric).centre)
+    width = CLOSE * abs(measured.mean(comparison.second, comparison.metric).centre)
     if -width <= found.low and found.high <= width:
         return "for"
     return "against" if found.low > width or found.high < -width else "open"

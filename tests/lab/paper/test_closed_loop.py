@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.lab.paper.claims import CLAIMS, DRIVERS, Claim, Contest, behind
+from alpasim_plugin.lab.paper.claims import CLAIMS, DRIVERS, Claim, Comparison, behind
 from alpasim_plugin.lab.paper.closed_loop import METRICS, Driven, closed_loop_section
 from alpasim_plugin.lab.paper.document import Findings, document, draw_figures
 from alpasim_plugin.lab.paper.published import published
@@ -93,22 +93,22 @@ def test_an_event_that_nobody_had_is_not_taken_for_equality() -> None:
     assert found.low is not None
     assert found.high is not None
     assert min(-found.low, found.high) > 0.05  # 20 scenes without an event do not bound a rate below some percent
-    contest = Contest(driven.protocol, "collision_at_fault", "difix", "3dgs", "close")
-    judged = judge_claims({driven.protocol: driven}, [Claim(9, "it is so", "here", (contest,))])
+    comparison = Comparison(driven.protocol, "collision_at_fault", "difix", "3dgs", "close")
+    judged = judge_claims({driven.protocol: driven}, [Claim(9, "it is so", "here", (comparison,))])
     assert judged[0].verdict == "undecided at our scale"
 
 
 @pytest.mark.parametrize(("first", "second", "outcome"), [("difix", "3dgs", "for"), ("3dgs", "V9", "against"), ("difix", "V9", "open")])
 def test_a_contest_is_decided_as_the_run_decides_it(first: str, second: str, outcome: str) -> None:
     driven = Driven("learned", rows_of(EVENTS))
-    judged = judge_claims({driven.protocol: driven}, [Claim(9, "", "", (Contest(driven.protocol, "offroad", first, second),))])
+    judged = judge_claims({driven.protocol: driven}, [Claim(9, "", "", (Comparison(driven.protocol, "offroad", first, second),))])
     assert judged[0].results[0].outcome == outcome
     assert driven.only([first, second]).difference("offroad", first, second) == judged[0].results[0].difference
 
 
 def test_the_claim_asks_both_policies() -> None:
     claim = next(claim for claim in CLAIMS if claim.number == 9)
-    assert {contest.protocol for contest in claim.contests} == {behind(policy) for policy in DRIVERS}
+    assert {comparison.protocol for comparison in claim.comparisons} == {behind(policy) for policy in DRIVERS}
     alone = Driven("learned", rows_of({**EVENTS, "omnidreams@4": never, "self-forcing": never}))
     judged = judge_claims({alone.protocol: alone}, [claim])[0]
     assert judged.verdict == "not measured"
@@ -133,8 +133,8 @@ def test_a_failed_rollout_is_in_no_rate_and_a_lopsided_interval_shows_its_bounds
     assert table(text, "renderer")["3dgs"][METRICS.index("offroad")].startswith("0.0 (0 of 59)")
     rows[0] |= {"status": "ok"}
     driven = Driven("learned", rows)
-    contest = Contest(driven.protocol, "offroad", "V9", "3dgs")
+    comparison = Comparison(driven.protocol, "offroad", "V9", "3dgs")
     findings = document(published(), Findings({driven.protocol: driven}, {}, {}), {}, "simrun bench paper")
     assert driven.difference("offroad", "V9", "3dgs").favours == 0
     assert "Claim 9** was not measured" in findings
-    assert re.fullmatch(r"-\d\.\d+ \[-\d\.\d+, \+\d\.\d+\]", difference_text(driven.difference(contest.metric, "V9", "3dgs")))
+    assert re.fullmatch(r"-\d\.\d+ \[-\d\.\d+, \+\d\.\d+\]", difference_text(driven.difference(comparison.metric, "V9", "3dgs")))

@@ -12,7 +12,7 @@ import scipy.stats
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.lab.learned_metrics.swapping import swap_test
 from alpasim_plugin.lab.paper.appearance import appearance_section
-from alpasim_plugin.lab.paper.claims import CLAIMS, Claim, Contest, within
+from alpasim_plugin.lab.paper.claims import CLAIMS, Claim, Comparison, within
 from alpasim_plugin.lab.paper.cost import Cost, Curve, Point, contested, cost_section, plot_cost
 from alpasim_plugin.lab.paper.document import EqualTime, Findings, document, draw_figures
 from alpasim_plugin.lab.paper.measured import Measured, from_rows
@@ -33,8 +33,8 @@ def arms(**shift: float) -> Measured:
     return Measured({arm: {c: {"psnr_db": level[c] + by + 0.1 * rng.normal()} for c in CLIPS} for arm, by in shift.items()})
 
 
-def verdict_of(measured: Measured, *contests: Contest) -> str:
-    return judge_claims({"cycle": measured}, [Claim(1, "it is so", "here", contests)])[0].verdict
+def verdict_of(measured: Measured, *comparisons: Comparison) -> str:
+    return judge_claims({"cycle": measured}, [Claim(1, "it is so", "here", comparisons)])[0].verdict
 
 
 def test_every_table_is_read_whole() -> None:
@@ -97,16 +97,16 @@ def test_a_distance_of_sets_is_tested_by_swapping_clips() -> None:
 )  # fmt: skip
 def test_a_claim_has_the_verdict_of_its_contest(relation: str, shift: float, verdict: str) -> None:
     measured = arms(a=shift, b=0.0)
-    assert verdict_of(measured, Contest("cycle", "psnr_db", "a", "b", relation)) == verdict  # type: ignore[arg-type]
+    assert verdict_of(measured, Comparison("cycle", "psnr_db", "a", "b", relation)) == verdict  # type: ignore[arg-type]
 
 
 def test_one_lost_contest_refutes_and_a_missing_arm_leaves_it_open() -> None:
     measured = arms(a=0.5, b=0.0)
-    won, lost = Contest("cycle", "psnr_db", "a", "b"), Contest("cycle", "psnr_db", "b", "a")
-    absent = Contest("cycle", "psnr_db", "a", "nobody")
+    won, lost = Comparison("cycle", "psnr_db", "a", "b"), Comparison("cycle", "psnr_db", "b", "a")
+    absent = Comparison("cycle", "psnr_db", "a", "nobody")
     assert verdict_of(measured, won, absent) == "not measured"
     assert verdict_of(measured, won, absent, lost) == "does not hold"
-    assert verdict_of(measured, Contest("closed-loop", "offroad", "a", "b")) == "not measured"
+    assert verdict_of(measured, Comparison("closed-loop", "offroad", "a", "b")) == "not measured"
 
 
 def test_the_p_value_of_a_difference_is_that_of_the_paired_t_test() -> None:
@@ -118,13 +118,13 @@ def test_the_p_value_of_a_difference_is_that_of_the_paired_t_test() -> None:
     assert (equal.difference("psnr_db", "a", "b").p_value, equal.difference("psnr_db", "a", "c").p_value) == (0.0, 1.0)
 
 
-def lost_with(p_value: float, others: int) -> tuple[Measured, tuple[Contest, ...]]:
-    """Return one contest that is lost with a two-sided p-value, and others that are level."""
+def lost_with(p_value: float, others: int) -> tuple[Measured, tuple[Comparison, ...]]:
+    """Return one comparison that is lost with a two-sided p-value, and others that are level."""
     x = np.linspace(-1, 1, len(CLIPS))
     shift = scipy.stats.t.isf(p_value / 2, len(CLIPS) - 1) * x.std(ddof=1) / np.sqrt(len(CLIPS))
     values = {"a": np.zeros(len(CLIPS)), "b": x + shift, **{f"c{i}": x for i in range(others)}}
     measured = Measured({arm: {c: {"psnr_db": float(v)} for c, v in zip(CLIPS, many, strict=True)} for arm, many in values.items()})
-    return measured, tuple(Contest("cycle", "psnr_db", "a", rival) for rival in values if rival != "a")
+    return measured, tuple(Comparison("cycle", "psnr_db", "a", rival) for rival in values if rival != "a")
 
 
 @pytest.mark.parametrize(
@@ -136,8 +136,8 @@ def lost_with(p_value: float, others: int) -> tuple[Measured, tuple[Contest, ...
     ],
 )  # fmt: skip
 def test_a_lost_contest_refutes_if_it_is_lost_among_so_many(p_value: float, others: int, verdict: str) -> None:
-    measured, contests = lost_with(p_value, others)
-    judged = judge_claims({"cycle": measured}, [Claim(1, "it is so", "here", contests)])[0]
+    measured, comparisons = lost_with(p_value, others)
+    judged = judge_claims({"cycle": measured}, [Claim(1, "it is so", "here", comparisons)])[0]
     assert judged.verdict == verdict
     assert judged.count("against") == (p_value < 0.05), "by its own interval it is lost all the same"
     assert judged.results[0].refutes == pytest.approx(min(p_value / 2 * (others + 1), 1.0))
@@ -151,7 +151,7 @@ def test_the_correction_is_holms() -> None:
 @pytest.mark.parametrize(("level", "verdict"), [(0.97, "holds"), (0.85, "does not hold"), (0.9, "undecided at our scale")])
 def test_a_contest_with_a_bound_asks_whether_the_mean_is_shown_to_be_on_one_side(level: float, verdict: str) -> None:
     measured = Measured({"a": {clip: {"style_acc_syn": level + (0.02 if i % 2 else -0.02)} for i, clip in enumerate(CLIPS)}})
-    assert verdict_of(measured, Contest("cycle", "style_acc_syn", "a", "0.9", bound=0.9)) == verdict
+    assert verdict_of(measured, Comparison("cycle", "style_acc_syn", "a", "0.9", bound=0.9)) == verdict
     exact = Measured({"a": {clip: {"style_acc_syn": level} for clip in CLIPS}})
     assert exact.margin("style_acc_syn", "a", 0.9).difference == pytest.approx(level - 0.9)
 
@@ -195,10 +195,10 @@ def test_claims_name_arms_and_metrics_that_there_are() -> None:
     known = {arm for table in published().tables.values() for arm in table.rows} | {"3dgs", "3dgs + formula", "harmonizer-temporal-teacher"}
     measured_as = {metric.ours for metric in published().metrics.values()} | {"ms_per_frame", "drift_psnr_db", "fd_syn_16"}
     for claim in CLAIMS:
-        assert claim.contests
-        for contest in claim.contests:
-            assert {arm.partition(",")[0] for arm in contest.arms} <= known, claim.number
-            assert contest.metric.removesuffix(".seed1") in measured_as
+        assert claim.comparisons
+        for comparison in claim.comparisons:
+            assert {arm.partition(",")[0] for arm in comparison.arms} <= known, claim.number
+            assert comparison.metric.removesuffix(".seed1") in measured_as
     assert [claim.number for claim in CLAIMS] == list(range(1, 15))
 
 
@@ -342,7 +342,7 @@ def test_training_time_of_two_seeds_is_compared_in_each(tmp_path: Path) -> None:
     text = cost_section(cost, "cost.png")
     assert "- self-forcing, seed 7: self-forcing to 5" in text
     assert "core-minutes of self-forcing, seed 7 (2.5), V9 has the snapshot of 2 updates" in text
-    assert "| contest | seed 3 | seed 7 |" in text
+    assert "| comparison | seed 3 | seed 7 |" in text
     plot_cost(cost, tmp_path / "cost.png")
     assert (tmp_path / "cost.png").stat().st_size > 10_000
 
