@@ -48,7 +48,6 @@ app.command("per-frame", epilog=PER_FRAME_EXAMPLES)(per_frame)
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("arms", epilog=ARMS_EXAMPLES)(arms)
 app.command("decoder", epilog=DECODER_EXAMPLE)(decoder)
-app.command("painter", hidden=True)(decoder)  # former name
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 app.command("policy-data", epilog=POLICY_DATA_EPILOG)(policy_data)
 app.command("policy", epilog=POLICY_EPILOG)(policy)

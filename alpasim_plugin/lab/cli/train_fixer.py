@@ -102,7 +102,6 @@ def train_fixer_command(
             help="Show the map's cars in the colours of another class in mirrored clips.",
         ),
     ] = True,
-    recolour: Annotated[bool, typer.Option("--recolour/--no-recolour", hidden=True, help="Former name of the option above.")] = True,
     stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
     precision: options.Precision = "fp32",
     snapshots: options.Snapshots = 0,
@@ -123,7 +122,7 @@ def train_fixer_command(
         do = "leave out --block, --window and --sink"
         raise InputError("choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do)
     schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
-    form = ClipForm(latents, stride, class_colour_augmentation and recolour)
+    form = ClipForm(latents, stride, class_colour_augmentation)
     batches = BatchForm(clips, None, columns, seed)
     own_size = None if size is None else parse_size(size)
     files, equal = named_weights(init, weights or []), channels == "equal"

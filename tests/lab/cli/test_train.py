@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from alpasim_plugin.block_fixers.networks import load_tiny_vae
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
@@ -19,7 +18,6 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.cli.training_options import scene_files, whole_numbers
 from policies.learned_net import load_net
 from tests.block_fixers.fixer_cases import small_settings
@@ -170,13 +168,3 @@ def test_what_is_no_list_of_whole_numbers_is_refused(text: str) -> None:
     assert whole_numbers("--horizon", "0, 4", 0) == [0, 4]
     with pytest.raises(InputError, match="--horizon"):
         whole_numbers("--horizon", text, 0)
-
-
-def test_former_names_of_a_verb_and_an_option_are_accepted_and_hidden() -> None:
-    run = CliRunner()
-    assert "painter" not in run.invoke(app, ["--help"]).output
-    assert "Fine-tune the decoder" in run.invoke(app, ["painter", "--help"]).output
-    assert "recolour" not in run.invoke(app, ["fixer", "--help"]).output
-    refused = run.invoke(app, ["fixer", "absent", "--vae", "absent", "--out", "absent", "--no-recolour", "--variant", "V0"])
-    assert isinstance(refused.exception, InputError)
-    assert "no such recipe" in str(refused.exception)
