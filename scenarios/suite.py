@@ -20,6 +20,7 @@ from scenarios.schema_parts import Part, within
 from scenarios.sources import source_of
 
 DOING = "reading a suite"
+MOST_SUITES = 256  # read for one argument, through suites of suites
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
     Raises:
         InputError: Nothing there, an empty folder, or a bad suite file.
     """
-    return _expand(str(path_or_name), None, ())
+    return _expand(str(path_or_name), None, (), [])
 
 
 def expand(item: str, overrides: Sequence[str] = (), source: str | None = None) -> list[ScenarioRef]:
@@ -73,7 +74,7 @@ def expand(item: str, overrides: Sequence[str] = (), source: str | None = None) 
     return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
 
 
-def _expand(text: str, base: Path | None, chain: tuple[Path, ...]) -> list[ScenarioRef]:
+def _expand(text: str, base: Path | None, chain: tuple[Path, ...], opened: list[Path]) -> list[ScenarioRef]:
     path = _locate(text, base)
     if path.is_dir():
         if source_of(path) is not None:
@@ -86,13 +87,17 @@ def _expand(text: str, base: Path | None, chain: tuple[Path, ...]) -> list[Scena
         return [ScenarioRef(str(path))]
     if path.resolve() in chain:
         raise InputError(DOING, str(path), "a suite that contains itself", "remove the entry")
+    opened.append(path)
+    if len(opened) > MOST_SUITES:
+        found = f"more than {MOST_SUITES} suites to read, {len(set(opened))} different ones"
+        raise InputError(DOING, str(path), found, "name each suite once")
     document = load_yaml(path, DOING)
     spec = validate(SuiteSpec, document, DOING)
     out: list[ScenarioRef] = []
     for i, entry in enumerate(spec.scenarios):
         item = SuiteItem(path=entry) if isinstance(entry, str) else entry
         try:
-            refs = _expand(item.path, path.resolve().parent, (*chain, path.resolve()))
+            refs = _expand(item.path, path.resolve().parent, (*chain, path.resolve()), opened)
         except InputError as e:
             raise _placed(document, i, e) from e
         extra = tuple(f"{key}={json.dumps(value)}" for key, value in item.set.items())

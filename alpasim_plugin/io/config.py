@@ -25,6 +25,9 @@ from alpasim_plugin.io.yaml_positions import Document, Key, Mark, parse
 __all__ = ["Document", "Mark", "apply_overrides", "load_yaml", "parse_scalar", "validate"]
 
 
+MOST_READ = 64  # files of one document, through extends
+
+
 def load_yaml(path: str | Path, doing: str = "reading a configuration") -> Document:
     """Read a YAML file and everything that its ``extends:`` list names.
 
@@ -35,7 +38,7 @@ def load_yaml(path: str | Path, doing: str = "reading a configuration") -> Docum
         InputError: Missing or unreadable file, YAML syntax (with line and column), duplicate or non-text key, a bound exceeded,
             or a cycle of ``extends``.
     """
-    return _load(Path(path), doing, ())
+    return _load(Path(path), doing, (), [])
 
 
 def parse_scalar(text: str, doing: str, with_what: str) -> Any:
@@ -70,10 +73,15 @@ def apply_overrides(document: Document, overrides: Sequence[str], doing: str = "
     return Document(data, marks, document.path, document.sources, (*document.overrides, *overrides))
 
 
-def _load(path: Path, doing: str, chain: tuple[Path, ...]) -> Document:
+def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> Document:
+    """Read a file and its bases; ``read`` counts every reading: files that name each other twice double at each step."""
     resolved = path.resolve()
     if resolved in chain:
         raise InputError(doing, str(path), f"extends itself through {' -> '.join(str(p) for p in chain)}", "break the cycle of extends")
+    read.append(resolved)
+    if len(read) > MOST_READ:
+        found = f"more than {MOST_READ} files to read, {len(set(read))} different ones"
+        raise InputError(doing, str(path), found, "name each base once in extends")
     raw = read_bytes(path, doing, YAML_BYTES)
     try:
         text = raw.decode("utf-8")
@@ -94,7 +102,7 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...]) -> Document:
             base_path = resolved.parent / name
             if not base_path.is_file():
                 raise InputError(doing, str(at), f"extends {name!r}, but {base_path} does not exist", "correct the path")
-            base = _load(base_path, doing, (*chain, resolved))
+            base = _load(base_path, doing, (*chain, resolved), read)
             merged, merged_marks = _merged(merged, merged_marks, base.data, base.marks)
             sources.extend(base.sources)
         data, marks = _merged(merged, merged_marks, data, marks)
