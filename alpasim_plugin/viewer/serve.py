@@ -46,6 +46,13 @@ HEADERS = {
     "X-Frame-Options": "DENY",
 }
 
+NOTHING: Mapping[str, str] = {}
+# A run folder may come from anybody: a page in it may show what it holds itself, in an origin of its own, and ask nobody for anything.
+OF_A_RUN = {
+    "Content-Security-Policy": "sandbox allow-scripts allow-popups; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src 'self' data:; media-src 'self' data:; font-src data:"
+}
+
 
 def loopback(text: str) -> tuple[str, int]:
     """Read ``HOST:PORT`` or ``PORT`` of this machine.
@@ -208,16 +215,17 @@ class _Handler(BaseHTTPRequestHandler):
         """Send a file piece by piece: a log or a video may be larger than the memory."""
         with path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
-            self._head(size, TYPES[path.suffix], HTTPStatus.OK)
+            self._head(size, TYPES[path.suffix], HTTPStatus.OK, OF_A_RUN)
             left = size
             while left and (piece := stream.read(min(left, PIECE))):
                 self.wfile.write(piece)
                 left -= len(piece)
-            self.close_connection = left > 0  # it was cut meanwhile: the client sees too few bytes
+            if left:  # it was cut meanwhile: the client sees too few bytes
+                self.close_connection = True
 
-    def _head(self, size: int, kind: str, status: HTTPStatus) -> None:
+    def _head(self, size: int, kind: str, status: HTTPStatus, more: Mapping[str, str] = NOTHING) -> None:
         self.send_response(status)
-        for name, value in {"Content-Type": kind, "Content-Length": str(size), **HEADERS}.items():
+        for name, value in {"Content-Type": kind, "Content-Length": str(size), **HEADERS, **more}.items():
             self.send_header(name, value)
         self.end_headers()
 

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import shutil
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -158,6 +159,27 @@ def test_files_of_the_run_are_given(server: RunServer, running: tuple[Path, Any]
     assert (status, headers["content-type"]) == (200, "image/jpeg")
     assert body == (running[0] / "rollouts/clean/lane-camera/smoke-straight/0/strip.jpg").read_bytes()
     assert file_below(running[0], "run.json") == running[0] / "run.json"
+
+
+def test_a_page_of_the_run_is_an_origin_of_its_own_that_may_ask_nobody(server: RunServer, running: tuple[Path, Any]) -> None:
+    (running[0] / "sent.html").write_text("<script>fetch('/index.json')</script>")
+    status, headers, _ = ask(server, "/run/sent.html")
+    policy = headers["content-security-policy"]
+    assert status == 200
+    assert policy.startswith("sandbox allow-scripts")
+    assert "allow-same-origin" not in policy
+    assert "default-src 'none'" in policy
+    assert "connect-src" not in policy
+
+
+def test_a_client_that_wants_the_connection_closed_gets_it_closed_after_a_file(server: RunServer) -> None:
+    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=20) as wire:
+        host = f"127.0.0.1:{server.server_address[1]}"
+        wire.sendall(f"GET /run/run.json HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        answer = b""
+        while piece := wire.recv(65536):  # ends when the server closes; otherwise the time limit ends it with an error
+            answer += piece
+    assert answer.startswith(b"HTTP/1.1 200")
 
 
 def test_many_askers_wait_for_one_look_at_the_folder(running: tuple[Path, Any]) -> None:
