@@ -22,7 +22,7 @@ import torch
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
-from alpasim_plugin.block_fixers.whole_clip import whole_clip
+from alpasim_plugin.block_fixers.whole_clip import Clip, whole_clip
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers import fixer_settings
@@ -30,7 +30,7 @@ from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench import pixel_fixer
 from alpasim_plugin.lab.bench.fixer_drive import drive
 from alpasim_plugin.lab.bench.fixer_rows import DRIVEN, SCENE, Bench, BenchOptions, Case, Row, difference, in_own_process, p50_p95
-from alpasim_plugin.lab.bench.fixer_speed import Clip, Timing, measure
+from alpasim_plugin.lab.bench.fixer_speed import Timing, measure
 from alpasim_plugin.runtime.provenance import hardware, versions
 
 SLOW_FRAMES = 21  # of a slow row's clip: three blocks

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.block_fixers.whole_clip import Clip
 from alpasim_plugin.core.types import U8, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.lab.bench.fixer_speed import Clip
 from alpasim_plugin.plugins.interfaces import Fixer, Renderer
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder

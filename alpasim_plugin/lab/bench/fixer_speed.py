@@ -6,7 +6,6 @@ Passes without any clock give the all-in times, further passes with a clock at e
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,53 +14,11 @@ import torch
 from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock, no_clock
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.whole_clip import Clip
 from alpasim_plugin.core.processes import resident_mb
-from alpasim_plugin.core.types import F32, I64, U8, Bool, Frame
+from alpasim_plugin.core.types import U8, Bool
 
 MB = 1e6
-
-
-@dataclass(frozen=True)
-class Clip:
-    """Frames of one camera with their semantic maps, the input of a fixer in a rollout.
-
-    Attributes:
-        camera: Its name.
-        t_us: ``(T,)`` int64 microseconds.
-        rgb: ``(T, H, W, 3)`` uint8 sRGB.
-        alpha: ``(T, H, W)`` float32 opacity, 0 to 1.
-        maps: ``(T, H, W, 3)`` uint8 semantic maps.
-    """
-
-    camera: str
-    t_us: I64
-    rgb: U8
-    alpha: F32
-    maps: U8
-
-    @classmethod
-    def of(cls, frames: Sequence[Frame], maps: Sequence[U8]) -> Clip:
-        """Stack frames of one camera and their maps; a frame without opacity counts as opaque."""
-        alpha = [np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha for frame in frames]
-        times = np.array([frame.t_us for frame in frames], dtype=np.int64)
-        return cls(frames[0].camera, times, np.stack([frame.rgb for frame in frames]), np.stack(alpha), np.stack(maps))
-
-    def first(self, count: int) -> Clip:
-        """Return the first frames."""
-        return Clip(self.camera, self.t_us[:count], self.rgb[:count], self.alpha[:count], self.maps[:count])
-
-    def frames(self) -> list[Frame]:
-        """Return the frames."""
-        rows = zip(self.t_us, self.rgb, self.alpha, strict=True)
-        return [Frame(int(t_us), self.camera, rgb, alpha) for t_us, rgb, alpha in rows]
-
-    def blocks(self, rule: Callable[[int], int]) -> Iterator[tuple[list[Frame], list[U8]]]:
-        """Yield whole blocks of frames with their maps; frames at the end that fill no block are left out."""
-        frames, start, index = self.frames(), 0, 0
-        while start + rule(index) <= len(frames):
-            end = start + rule(index)
-            yield frames[start:end], list(self.maps[start:end])
-            start, index = end, index + 1
 
 
 @dataclass

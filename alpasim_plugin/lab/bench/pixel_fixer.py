@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from alpasim_plugin.block_fixers.whole_clip import Clip
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.processes import resident_mb
 from alpasim_plugin.core.types import U8
@@ -16,7 +17,7 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench.fixer_rows import SCENE, BenchOptions, Case, Row, difference, in_own_process, p50_p95
-from alpasim_plugin.lab.bench.fixer_speed import MB, Clip, Timing
+from alpasim_plugin.lab.bench.fixer_speed import MB, Timing
 
 CASES = (
     Case("precision", "float32", ("precision=fp32",)),

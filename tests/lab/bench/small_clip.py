@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.lab.bench.fixer_speed import Clip
+from alpasim_plugin.block_fixers.whole_clip import Clip
 
 
 def driving_clip(frames: int, width: int = 64, height: int = 48) -> Clip:
