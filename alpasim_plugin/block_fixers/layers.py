@@ -153,7 +153,7 @@ class PatchEmbed(nn.Module):
 def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None) -> Tensor:
     """Embed latents together with their masks.
 
-    A mask that is None is zero, so its columns of the embedding are skipped.
+    Without a mask it is zero, so its columns of the embedding are skipped.
 
     Args:
         embed: Embedding of C + 2 channels.

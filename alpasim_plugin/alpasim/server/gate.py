@@ -26,7 +26,7 @@ LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 LIGHT = 32  # threads for calls that never render nor drive
 AWAITED, LIGHT_AWAITED = 64, 16  # calls whose message has not come: for one more, the oldest is dropped
 MESSAGE_S = 30.0  # how long a message may take to come
-WATCHERS = 64  # callers that are told when the health changes
+WATCHERS = 64  # streams that are sent every change of the health
 
 
 class Health:

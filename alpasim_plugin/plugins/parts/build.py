@@ -50,7 +50,7 @@ def _arguments(factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any
     """Choose what a factory asks for by the names of its parameters.
 
     Raises:
-        InputError: It has a parameter without default that is none of them (of a policy: `PolicyError`).
+        InputError: It has a required parameter that is not one of them (of a policy: `PolicyError`).
     """
     try:
         parameters = inspect.signature(factory).parameters.values()
