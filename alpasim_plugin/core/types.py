@@ -152,6 +152,33 @@ class Frame:
     facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
 
 
+@dataclass(frozen=True)
+class Photograph:
+    """A picture of the recorded drive in a file, undistorted, and where it was taken, as the reconstruction believes."""
+
+    t_us: int
+    camera: str
+    width: int
+    height: int
+    K: F64  # (3, 3) pixels
+    T_world_camera: F64  # (4, 4)
+    path: str  # of the picture
+    exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gain of each channel, by which the reconstruction explains this picture
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """A frame of the recorded drive that a renderer declares, for a fixer to look at."""
+
+    t_us: int
+    camera: str
+    K: F64  # (3, 3) pixels, of ``rgb``
+    T_world_camera: F64  # (4, 4), as the reconstruction believes
+    rgb: U8  # (H, W, 3) sRGB
+    depth: F32  # (H, W) metres, as the renderer sees it from there; 0 where it shows nothing, or sky
+    actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4) of those present
+
+
 # --- policy ---------------------------------------------------------------------------------------------------------
 
 
@@ -279,6 +306,7 @@ class Scenario:
     alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
     source_part: str | None = None  # the source that read the log, as named; None: a built road
     varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # key of the scenario file -> (as written, as drawn by the seed)
+    recording: tuple[Photograph, ...] = ()  # the drive's photographs, of an imported drive
     stop_at_path_end: bool = True  # a rollout ends where the recorded path does, unless the recorded car stands there
 
     @property

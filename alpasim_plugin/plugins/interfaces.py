@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         MetricSeries,
         Observation,
         Plan,
+        RecordedFrame,
         RenderRequest,
         RolloutLog,
         Route,
@@ -94,6 +95,10 @@ class Renderer(Protocol):
     def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
         """Render all requests of an instant (of all cameras; of a whole block with ``block``). One by one unless overridden."""
         return [self.render(request) for request in requests]
+
+    def recorded(self) -> Sequence[RecordedFrame]:
+        """Return the frames of the recorded drive that the renderer's model was made from; none unless overridden."""
+        return ()
 
     def facts(self) -> Mapping[str, Any]:
         """Return what the session is and did, for the rollout's manifest."""
