@@ -7,7 +7,7 @@ coordinates in b to coordinates in a; quaternions are ``wxyz``; images are HWC u
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -147,9 +147,10 @@ class Frame:
     camera: str
     rgb: U8  # (H, W, 3) sRGB
     alpha: F32 | None = None  # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
-    depth: F32 | None = None  # (H, W) metres along the optical axis, alpha-weighted mean; 0 where alpha is 0
+    depth: F32 | None = None  # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
     facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
+    references: tuple[U8, ...] = ()  # (H, W, 4) recorded frames, warped into this view, nearest first; the last channel says where they hold
 
 
 @dataclass(frozen=True)
@@ -172,11 +173,10 @@ class RecordedFrame:
 
     t_us: int
     camera: str
-    K: F64  # (3, 3) pixels, of ``rgb``
+    K: F64  # (3, 3) pixels, of the picture
     T_world_camera: F64  # (4, 4), as the reconstruction believes
-    rgb: U8  # (H, W, 3) sRGB
-    depth: F32  # (H, W) metres, as the renderer sees it from there; 0 where it shows nothing, or sky
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4) of those present
+    read: Callable[[], tuple[U8, F32]]  # (H, W, 3) sRGB; (H, W) metres, as the renderer sees it from there, 0 where it shows nothing or sky
 
 
 # --- policy ---------------------------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ class PixelSizesSettings(Part):
     detail: Positive = Field(default=16, description="Channels of the detail path at 1/2.")
     hidden: int = Field(default=16, ge=0, description="Recurrent channels at 1/4.")
     memory: int = Field(default=0, ge=0, description="Past frames, every fourth, that are attended to at 1/16; 0: none.")
+    blend: int = Field(default=0, ge=0, description="Channels of the head that blends references with the picture; 0: none are read.")
 
 
 PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map"))

@@ -35,9 +35,9 @@ from alpasim_plugin.nets.pixel_layers import (
     repeat_per_pixel,
     small,
 )
+from alpasim_plugin.nets.reference_blend import CELL, DETAIL, ReferenceBlend, beside_render
 
 GRID_PX = 16  # sides are multiples of it
-CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
 IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
 DETAIL_IMAGES = 7  # render 3, opacity 1, last output 3
 DOING = "building a generator in pixels"
@@ -53,6 +53,7 @@ class PixelSizes:
         detail: Channels of the detail path at 1/2.
         hidden: Recurrent channels at 1/4; 0: none.
         memory: Past frames that are attended to at 1/16 (`nets.pixel_layers`); 0: none.
+        blend: Channels of the head that blends references with the picture (`nets.reference_blend`); 0: references are not read.
     """
 
     widths: tuple[int, int, int] = (48, 80, 160)
@@ -60,6 +61,7 @@ class PixelSizes:
     detail: int = 16
     hidden: int = 16
     memory: int = 0
+    blend: int = 0
 
 
 class PixelState(NamedTuple):
@@ -70,6 +72,7 @@ class PixelState(NamedTuple):
     hidden: Tensor  # (B, H / 4, W / 4, hidden) in (-1, 1)
     kept: Tensor  # (B, memory, cells at 1/16, channels) keys and values of past frames
     frames: Tensor  # (B, 1, 1, 1) how many came so far
+    recorded: Tensor  # (B, H, W, 1) share of the references in the last output, 0 to 1
 
     def detached(self) -> PixelState:
         """Return the same values, cut off from the graph that made them."""
@@ -140,6 +143,7 @@ class PixelGenerator(nn.Module):
         self.refine = Conv3(sizes.detail, sizes.detail)
         self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
         repeat_per_pixel(self.write, DETAIL)
+        self.blend = ReferenceBlend(at4, sizes.detail, sizes.blend) if sizes.blend else None
         nn.init.zeros_(self.time.weight)
 
     @classmethod
@@ -159,10 +163,18 @@ class PixelGenerator(nn.Module):
         hidden = render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden)
         at16 = (h // GRID_PX) * (w // GRID_PX)
         empty = MemoryState(render.new_zeros(b, 0, at16, 0), render.new_zeros(b, 1, 1, 1))
-        return PixelState(render, render, hidden, *(empty if self.memory is None else self.memory.start(render, at16)))
+        memory = empty if self.memory is None else self.memory.start(render, at16)
+        return PixelState(render, render, hidden, *memory, render.new_zeros(b, h, w, 1))
 
     def forward(
-        self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None, t: Tensor | None = None
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        state: PixelState,
+        source: Tensor | None = None,
+        t: Tensor | None = None,
+        references: Tensor | None = None,
     ) -> tuple[Tensor, PixelState]:
         """Predict the clean frame.
 
@@ -173,17 +185,26 @@ class PixelGenerator(nn.Module):
             state: From `start` or the last call.
             source: ``(B, H, W, 3)`` z_t; None is the render, which is z_1 where nothing is transparent.
             t: ``(B,)`` flow time; None is 1, the deployed step.
+            references: ``(B, K, H, W, 4)`` recorded frames in this view, colour in [-1, 1] and where it holds, 0 to 1; None: there is none.
+                A network without a blending head does not read them.
 
         Returns:
             ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
         """
-        return self.from_cells(gather_cells(render, opacity, sdmap, state, source), render, state, t)
+        return self.from_cells(gather_cells(render, opacity, sdmap, state, source), render, state, t, references)
 
-    def from_cells(self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None) -> tuple[Tensor, PixelState]:
+    def from_cells(
+        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, references: Tensor | None = None
+    ) -> tuple[Tensor, PixelState]:
         """Predict the clean frame from what `gather_cells` gathered; see `forward`."""
         dtype = self.stem.weight.dtype
-        coarse, fine = gathered.coarse.to(dtype), gathered.fine.to(dtype)
-        x4 = self.encode4(self.mix(activation(self.stem(coarse), inplace=True)))
+        stem, read = self.stem(gathered.coarse.to(dtype)), self.read(gathered.fine.to(dtype))
+        beside = None
+        if self.blend is not None and references is not None:
+            beside = beside_render(references, render)
+            at4, at2 = self.blend.features(beside)
+            stem, read = stem + at4, read + at2
+        x4 = self.encode4(self.mix(activation(stem, inplace=True)))
         x8 = self.down8(activation(x4))
         if t is not None:
             x8 = x8 + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
@@ -195,10 +216,12 @@ class PixelGenerator(nn.Module):
         y = self.decode8(self.up8(y).add_(x8))
         y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
-        fine = activation(self.read(fine).add_(self.up2(y)), inplace=True)
+        fine = activation(read.add_(self.up2(y)), inplace=True)
         fine = activation(self.refine(fine), inplace=True)
-        out = pixels(self.write(fine), DETAIL).float() + render
-        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames)
+        out, recorded = pixels(self.write(fine), DETAIL).float() + render, torch.zeros_like(render[..., :1])
+        if self.blend is not None and references is not None and beside is not None:
+            out, recorded = self.blend(fine, render, out, references, beside)
+        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames, recorded)
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
@@ -241,4 +264,5 @@ def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
     widths = (width("stem.weight"), width("down8.weight"), width("down16.weight"))
     blocks = (depth("encode4"), depth("encode8"), depth("middle"), depth("decode8"), depth("decode4"))
     memory = width("memory.age") if "memory.age" in tensors else 0
-    return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory)
+    blend = width("blend.head.weight") if "blend.head.weight" in tensors else 0
+    return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory, blend)

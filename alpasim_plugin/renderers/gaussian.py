@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TypeVar
@@ -17,7 +17,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.core.types import F64, Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F64, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import scaled_camera
@@ -29,6 +29,7 @@ from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.background import read_background
+from alpasim_plugin.renderers.recorded import built_recording
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
@@ -61,7 +62,7 @@ class CleanRenderer(Renderer):
 
     def _frame(self, request: RenderRequest, out: RasterOutput) -> Frame:
         self.stats = out.stats
-        return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
+        return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth())
 
 
 class SurrogateRenderer(CleanRenderer):
@@ -85,6 +86,10 @@ class SurrogateRenderer(CleanRenderer):
         gain = self.surrogate.gain(request.t_us, self.seed, w)
         shown = np.maximum(out.alpha, self.sky.share(camera))
         return self._frame(request, replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0), alpha=shown))
+
+    def recorded(self) -> Sequence[RecordedFrame]:
+        """Return the scene as built, as its cameras saw it along the log; depth is the built scene's too."""
+        return built_recording(self.scenario, self.scene, self.scene.render, None)
 
     def _graph(self, w: float) -> SceneGraph:
         if w not in self._graphs:

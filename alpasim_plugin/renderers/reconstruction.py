@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
@@ -21,7 +21,8 @@ from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.cache import cached
-from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory
+from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory, scene_of
+from alpasim_plugin.renderers.recorded import built_recording
 from alpasim_plugin.renderers.reconstruction_files import read_model
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, recipe_of, reconstruction_key
 
@@ -56,7 +57,11 @@ class ReconstructionRenderer(Renderer):
         out = self.model.graph.render(camera, request.actors, self.threads, self.backend)
         self.stats = out.stats
         shown = np.maximum(out.alpha, self.model.sky.share(camera))
-        return Frame(request.t_us, request.camera.name, out.to_uint8(), shown, out.depth)
+        return Frame(request.t_us, request.camera.name, out.to_uint8(), shown, out.surface_depth())
+
+    def recorded(self) -> Sequence[RecordedFrame]:
+        """Return what the scenario's cameras saw along the log, at the poses that the reconstruction believes."""
+        return built_recording(self.scenario, scene_of(self.scenario), self.model.graph.render, recipe_of(self.scenario))
 
 
 def reconstruction_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:

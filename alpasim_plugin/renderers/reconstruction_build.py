@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.fit.start import Start, start_from_depth
 from alpasim_plugin.gaussians.fit.views import PosedView, logged_views
 from alpasim_plugin.gaussians.scene.log_views import SkyView
 from alpasim_plugin.renderers.gaussian import scene_of
+from alpasim_plugin.renderers.recorded import TURN_RAD_PER_M, pose_errors
 from alpasim_plugin.renderers.reconstruction_files import write_model
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
@@ -90,8 +91,6 @@ def _one_torch_thread() -> Iterator[None]:
 
 PATCH_SHARE = 0.075  # of the image's width: neighbours within a patch are wrong together
 LEAST, MOST = 0.5, 2.0  # a depth is never wrong by more than these factors
-POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
-TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
 
 def misplaced(views: Sequence[PosedView], spread_m: float, scene_id: str, seed: int) -> list[PosedView]:
@@ -104,16 +103,11 @@ def misplaced(views: Sequence[PosedView], spread_m: float, scene_id: str, seed: 
     """
     if spread_m == 0:
         return list(views)
-    knots = stream(scene_id, seed, "reconstruction.poses").standard_normal((len(views) // POSE_KNOT_VIEWS + 2, 6))
-    at = np.arange(len(views)) / POSE_KNOT_VIEWS
-    errors = spread_m * np.stack([np.interp(at, np.arange(len(knots)), column) for column in knots.T], axis=1)  # (V, 6)
-    out = []
-    for view, error in zip(views, errors, strict=True):
-        T = np.eye(4)
-        T[:3, :3] = cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0]
-        T[:3, 3] = error[:3]
-        out.append(replace(view, camera=replace(view.camera, T_camera_world=T @ view.camera.T_camera_world)))
-    return out
+    errors = pose_errors(scene_id, seed, spread_m, len(views), np.arange(len(views)))
+    return [
+        replace(view, camera=replace(view.camera, T_camera_world=error @ view.camera.T_camera_world))
+        for view, error in zip(views, errors, strict=True)
+    ]
 
 
 def rough_start(views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: ReconstructionRecipe, scene_id: str) -> Start:

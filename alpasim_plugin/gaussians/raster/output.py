@@ -37,6 +37,10 @@ class RasterOutput:
         """Return ``(H, W)``: where anything was drawn, so that `depth` means something."""
         return self.alpha > 0
 
+    def surface_depth(self) -> F32:
+        """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the background shows through."""
+        return np.where(self.alpha >= 0.5, self.depth, np.float32(0))
+
     def to_uint8(self) -> npt.NDArray[np.uint8]:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""
         return np.asarray(self.rgb * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)

@@ -77,7 +77,7 @@ def pairs(
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")],
     split: Annotated[str, typer.Option("--split", help="Splits, comma-separated, in this order.")] = "val,train",
     source: Annotated[str, typer.Option("--source", help="Renderer of the degraded frames.")] = "3dgs",
-    max_offset_m: Annotated[float, typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres.")] = 1.5,
+    max_offset_m: Annotated[float, typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres.")] = 2.5,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the lateral offset.")] = 0,
     count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")] = None,
     jobs: Jobs = 1,

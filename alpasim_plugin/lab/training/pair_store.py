@@ -16,7 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -191,7 +191,9 @@ def pairs_digest(sequences: Sequence[PairSequence]) -> str:
     return hashlib.blake2b("\n".join(f"{s.name} {s.content}" for s in sequences).encode(), digest_size=8).hexdigest()
 
 
-def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapping[str, Any]) -> None:
+def write_sequence(
+    folder: Path, frames: Iterable[Pair], length: int, info: Mapping[str, Any], beside: Callable[[Path], None] | None = None
+) -> None:
     """Write a sequence atomically.
 
     Args:
@@ -199,6 +201,7 @@ def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapp
         frames: At most ``length`` frames of one size, consumed one at a time.
         length: Frames to allocate.
         info: Contents of sequence.json.
+        beside: Writes what lies beside the channels into the folder, after the last frame.
 
     Raises:
         InputError: No frame, or frames of changing size.
@@ -206,6 +209,8 @@ def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapp
     """
     with atomic_folder(folder, "writing training pairs") as partial:
         count = _write_arrays(partial, frames, length)
+        if beside is not None:
+            beside(partial)
         document = {**info, "frames": count, CONTENT: _content(partial)}
         (partial / SEQUENCE_FILE).write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
 

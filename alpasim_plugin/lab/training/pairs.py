@@ -14,6 +14,8 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
+from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
@@ -37,7 +39,7 @@ class PairRecipe:
 
     source: str = "3dgs"
     target: str = "clean"
-    max_offset_m: float = 1.5
+    max_offset_m: float = 2.5
     interval_us: int = 100_000
     camera: str | None = None
 
@@ -70,13 +72,22 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
     moving = [a.actor_id for a in scenario.actors if np.ptp(a.track.xyz, axis=0).max() > MOVING_M]
     lens = {"width": camera.width, "height": camera.height, "K": camera.K.tolist(), "T_rig_camera": camera.T_rig_camera.tolist()}
     facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
-    write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads), len(times), facts)
+    source = make_renderer(recipe.source, scenario, seed=seed, threads=threads)
+    geometry: list[FrameGeometry] = []
+    recorded = [frame for frame in source.recorded() if frame.camera == camera.name]
+
+    def beside(partial: Path) -> None:
+        if recorded:
+            write_references(partial, geometry, recorded, scenario.actors)
+
+    write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads, source, geometry), len(times), facts, beside)
     return True
 
 
-def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed: int, threads: int) -> Iterator[Pair]:
-    """Yield the frames of one sequence in order of time."""
-    source = make_renderer(recipe.source, scenario, seed=seed, threads=threads)
+def pair_frames(
+    scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed: int, threads: int, source: Renderer, geometry: list[FrameGeometry]
+) -> Iterator[Pair]:
+    """Yield the frames of one sequence in order of time, and append depth and actors of each to ``geometry``."""
     target = make_renderer(recipe.target, scenario, seed=seed, threads=threads)
     layers = prepare_map(scenario.lane_map)
     offset_m = lateral_offsets(scenario, recipe, seed)
@@ -85,8 +96,9 @@ def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed
         actors = log_actors(scenario, t_us)
         request = RenderRequest(t_us, camera, np.stack([T_world_camera, T_world_camera]), actors)
         damaged = source.render(request)
-        if damaged.alpha is None:
-            raise InputError(DOING, f"renderer {recipe.source!r}", "frames without opacity", "choose a renderer that gives it")
+        if damaged.alpha is None or damaged.depth is None:
+            raise InputError(DOING, f"renderer {recipe.source!r}", "frames without opacity or depth", "choose a renderer that gives both")
+        geometry.append(FrameGeometry(damaged.depth.astype(np.float16), actors))
         opacity = np.rint(damaged.alpha * 255).clip(0, 255).astype(np.uint8)
         sdmap = draw_map(layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=threads)
         yield Pair(damaged.rgb, target.render(request).rgb, opacity, sdmap, T_world_camera, t_us)

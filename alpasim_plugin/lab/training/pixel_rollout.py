@@ -41,7 +41,7 @@ class PixelObjectives:
         history: What the state holds of the past: the generator's ``own`` outputs, the truth in their place (``clean``), or the truth that
             the generator noised and denoised again (``redenoised``; no gradient passes through it).
         use_map: Whether the map is given; otherwise it is black.
-        mixed: Whether the source is Eq. 1; otherwise it is noise everywhere, with the render as a condition.
+        source: Eq. 1 (``mixed``), noise everywhere with the render as a condition (``noise``), or the render alone (``render``).
     """
 
     perceptual: float = 0.1
@@ -50,7 +50,7 @@ class PixelObjectives:
     horizon: int = 4
     history: History = "own"
     use_map: bool = True
-    mixed: bool = True
+    source: Literal["mixed", "noise", "render"] = "mixed"
     picture: float = 1.0
     grid: float = 0.01
 
@@ -75,6 +75,7 @@ class PixelSample:
         corner: Row and column from which the perceptual term sees the frames. Its network halves the resolution four times; from a fixed
             corner its grid would lie on the generator's, which then learns a pattern of period 4 that only this network prefers.
         t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
+        references: ``(B, T, K, H, W, 4)`` recorded frames in the view: colour in [-1, 1], and where it holds, 0 to 1.
     """
 
     render: Tensor
@@ -88,6 +89,7 @@ class PixelSample:
     perceptual_frames: Sequence[int]
     corner: tuple[int, int]
     t_history: Tensor
+    references: Tensor
 
 
 @dataclass(frozen=True)
@@ -121,24 +123,25 @@ def pixel_losses(
     outputs, flow = [], zero
     for i in range(frames):
         render, opacity, truth = sample.render[:, i], sample.opacity[:, i], sample.truth[:, i]
+        references = sample.references[:, i]
         sdmap = sample.sdmap[:, i] if objectives.use_map else torch.full_like(render, -1.0)
         if objectives.flow and i == sample.flow_frame:
             source = _source(render, opacity, sample.eps_flow, objectives)
             t = sample.t[:, None, None, None]
-            guess, _ = net(render, opacity, sdmap, state.detached(), interpolant(truth, source, t), sample.t)
+            guess, _ = net(render, opacity, sdmap, state.detached(), interpolant(truth, source, t), sample.t, references)
             flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
         if i and i % objectives.horizon == 0:
             state = state.detached()
         before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
-            out, state = net(render, opacity, sdmap, before, source)
+            out, state = net(render, opacity, sdmap, before, source, None, references)
         outputs.append(out)
         if objectives.history == "clean":
             state = state._replace(output=truth)
         elif objectives.history == "redenoised":
             t = sample.t_history[:, i]
             with torch.no_grad():
-                _, state = net(render, opacity, sdmap, before, interpolant(truth, source, t[:, None, None, None]), t)
+                _, state = net(render, opacity, sdmap, before, interpolant(truth, source, t[:, None, None, None]), t, references)
     made = torch.stack(outputs, dim=1)
     picture = (made - sample.truth).abs().mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
@@ -155,4 +158,6 @@ def pixel_losses(
 
 
 def _source(render: Tensor, opacity: Tensor, eps: Tensor, objectives: PixelObjectives) -> Tensor:
-    return pixel_source(render, opacity, eps) if objectives.mixed else eps
+    if objectives.source == "render":
+        return render
+    return pixel_source(render, opacity, eps) if objectives.source == "mixed" else eps

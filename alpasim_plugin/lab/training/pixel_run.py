@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +112,10 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
     if tensors is None:
         raise InputError(DOING, str(run.init), "no part generator.*", "give a checkpoint or a bundle of 'simrun train per-frame'")
     given = PixelGenerator.from_state_dict(tensors, str(run.init))
-    if given.sizes != net.sizes:
+    if replace(given.sizes, blend=net.sizes.blend) != net.sizes or given.sizes.blend not in (0, net.sizes.blend):
         raise InputError(DOING, str(run.init), f"sizes {given.facts} for {net.facts}", "choose the fixer of the same sizes")
-    return given
+    net.load_state_dict({**net.state_dict(), **given.state_dict()})  # a bundle that reads no references gets an untrained head
+    return net
 
 
 def sizes_of(settings: PixelFixerSettings) -> PixelSizes:

@@ -42,6 +42,11 @@ class FrameBatch(Protocol):
         ...
 
     @property
+    def references(self) -> Tensor:
+        """``(B, T, K, H, W, 4)`` recorded frames in the view."""
+        ...
+
+    @property
     def fresh(self) -> Tensor:
         """``(B,)`` whether a stream starts anew at this update."""
         ...
@@ -122,7 +127,7 @@ class PixelTask:
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
         t_history = torch.rand(whole[0], frames, generator=source)[slots]
         flow_frame, top, left = int(rng.integers(frames)), *(int(rng.integers(_corners(side))) for side in render.shape[2:4])
-        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history)
+        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history, got.references)
         return NoisyBatch(sample, got.fresh)
 
     def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:

@@ -69,7 +69,7 @@ class PixelVariant:
     @property
     def holes(self) -> str:
         """Where noise enters the source, as the fixer's setting says it."""
-        return "noise" if self.stages[-1].mixed else "everywhere"
+        return {"mixed": "noise", "noise": "everywhere", "render": "render"}[self.stages[-1].source]
 
 
 _ALL = (
@@ -78,10 +78,11 @@ _ALL = (
     PixelVariant("V3", (PIXELS_ALONE,), "terms in pixels alone"),
     PixelVariant("V4", (replace(FULL, horizon=1),), "k = 1"),
     PixelVariant("V5", (replace(FULL, use_map=False),), "black map"),
-    PixelVariant("V6", (replace(FULL, mixed=False),), "from noise everywhere, render as a condition"),
+    PixelVariant("V6", (replace(FULL, source="noise"),), "from noise everywhere, render as a condition"),
     PixelVariant("V7", (FLOW_ALONE, PIXELS_ALONE), "flow matching, then terms in pixels", (0.625, 0.375)),
     PixelVariant("V8", (replace(FULL, history="redenoised"),), "history noised and denoised again"),
     PixelVariant(DEPLOYED, (FULL,), "OneFixer"),
+    PixelVariant("V9-still", (replace(FULL, source="render"),), "OneFixer, without noise in holes"),
 )
 PIXEL_VARIANTS: Mapping[str, PixelVariant] = MappingProxyType({variant.name: variant for variant in _ALL})
 

@@ -21,6 +21,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, I64, U8
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
+from alpasim_plugin.lab.training.episode_references import ReferenceDraw, draw_references, pair_references, video_references
 from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
 
@@ -30,6 +31,8 @@ SIDE = 16  # crops are multiples of it
 # Probability of each augmentation of an episode: played backward, every second frame, mirrored, photometric, class colours of the map.
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
+P_BETTER, BETTER = 0.25, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
+P_GREY = 0.06  # recordings without colour
 P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
 # Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
 P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
@@ -71,6 +74,8 @@ class StreamBatch:
         target: ``(B, T, 3, h, w)`` in [-1, 1], clean.
         fresh: ``(B,)`` bool; false where the first frame follows the last one of the update before.
         kind: ``(B,)`` int64, index into `KINDS`.
+        references: ``(B, T, K, h, w, 4)`` recorded frames in the view, colour in [-1, 1] and where they hold, 0 to 1; all 0 where there is
+            none.
     """
 
     render: Tensor
@@ -79,6 +84,7 @@ class StreamBatch:
     target: Tensor
     fresh: Tensor
     kind: Tensor
+    references: Tensor
 
 
 @dataclass(frozen=True)
@@ -97,6 +103,9 @@ class Episode:
         sharpness, grain: Of the detail that undamaged frames get; zero leaves them.
         key: Of the grain's random stream.
         lost: In the place of the damage that the sequence was recorded with; None keeps that one.
+        references: Which recorded frames are there, and how wrong they are.
+        better: How far a render is moved to the truth, 0 to 1.
+        grey: Whether all is without colour.
     """
 
     kind: int
@@ -112,6 +121,9 @@ class Episode:
     grain: float
     key: str
     lost: LostResolution | None
+    references: ReferenceDraw
+    better: float
+    grey: bool
 
 
 class TrainingStreams:
@@ -158,9 +170,9 @@ class TrainingStreams:
         """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""
         slots = [self.episode_of(slot, i) for slot in range(self.batch)[some]]
         shown = [self._show(episode, at) for episode, at in slots]
-        render, opacity, sdmap, target = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
+        render, opacity, sdmap, target, references = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
         fresh = torch.tensor([at == 0 or i == 0 for _, at in slots])
-        return StreamBatch(render, opacity, sdmap, target, fresh, torch.tensor([episode.kind for episode, _ in slots]))
+        return StreamBatch(render, opacity, sdmap, target, fresh, torch.tensor([episode.kind for episode, _ in slots]), references)
 
     def episode_of(self, slot: int, i: int) -> tuple[Episode, int]:
         """Return what a slot shows at update ``i``, and how many updates of the episode came before."""
@@ -195,10 +207,14 @@ class TrainingStreams:
         key = f"streams.{slot}.{number}"
         loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
         lost = draw_lost_resolution(rng, *self.crop) if loses else None
-        return Episode(kind, sequence, start, step, top, left, flip, levels, other if class_colours else None, sharpness, grain, key, lost)
+        references, better, grey = draw_references(rng), float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER), rng.random() < P_GREY
+        car_class = other if class_colours else None
+        return Episode(
+            kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better, grey
+        )
 
-    def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32]:
-        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map and target of an episode's update."""
+    def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32]:
+        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target and references of an episode's update."""
         clip, kind = episode.sequence.clip, KINDS[episode.kind]
         index = there_and_back(episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip))
         columns = slice(episode.left, episode.left + self.crop[1])
@@ -218,7 +234,13 @@ class TrainingStreams:
             render, opacity = episode.lost.apply(target), opacity * episode.lost.opacity
         elif damaged:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
-        return render, opacity, self._map(cut(clip.sdmap), episode), target
+        render = render + np.float32(episode.better) * (target - render)
+        recorded = pair_references if kind in ("pairs", "identity") else video_references
+        source = episode.sequence if kind in ("pairs", "identity") else clip
+        references = _lit_references(recorded(source, episode.references, index, rows, columns), episode)  # type: ignore[operator]
+        if episode.grey:
+            render, target, references[..., :3] = _grey(render, 1), _grey(target, 1), _grey(references[..., :3], -1)
+        return render, opacity, self._map(cut(clip.sdmap), episode), target, references
 
     def _map(self, sdmap: U8, episode: Episode) -> F32:
         shown = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap
@@ -240,6 +262,23 @@ def there_and_back(index: I64, length: int) -> I64:
 def _lit(frames: U8, levels: F32) -> F32:
     """Map frames ``(T, h, w, 3)`` to ``(T, 3, h, w)`` by a table of levels."""
     return np.stack([levels[frames[..., c], c] for c in range(3)], axis=1)
+
+
+def _lit_references(references: U8, episode: Episode) -> F32:
+    """Map references ``(T, K, h, w, 4)`` to [-1, 1], with the episode's levels and each one's own gain; the last channel to 0..1."""
+    flipped = references[:, :, :, ::-1] if episode.flip else references
+    out = np.empty(flipped.shape, np.float32)
+    for c in range(3):
+        out[..., c] = episode.levels[flipped[..., c], c]
+    gains = episode.references.gains.astype(np.float32)[None, :, None, None]
+    out[..., :3] = np.clip((out[..., :3] + 1) * gains - 1, -1, 1)
+    out[..., 3] = flipped[..., 3] / np.float32(255)
+    return out * (out[..., 3:] > 0)
+
+
+def _grey(frames: F32, channels: int) -> F32:
+    """Replace the colours by their mean."""
+    return np.broadcast_to(frames.mean(axis=channels, keepdims=True), frames.shape).copy()
 
 
 def _detailed(frames: F32, sharpness: float, grain: float, rng: np.random.Generator) -> F32:

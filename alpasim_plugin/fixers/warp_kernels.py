@@ -1,0 +1,130 @@
+"""The compiled part of `alpasim_plugin.fixers.references`, and the plain arithmetic that it is held to."""
+
+# Numba's decorators are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from alpasim_plugin.core.types import F32, F64, U8, Bool
+
+INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
+NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
+SLACK, SLACK_M = 0.12, 0.4  # two depths agree within this share and this length: reconstructions are no better
+AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
+SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
+HELD, DOUBTED = 255, 128
+
+
+def warp_coordinates(
+    depth: F32, K: F64, T_world_camera: F64, K_then: F64, T_then_world: F64, depth_then: F32, T_box_world: F64, T_then_box: F64, sizes: F64
+) -> tuple[F32, F32, U8]:
+    """Return where every pixel of a view is to be looked up in a recorded frame, and how well that holds.
+
+    Args:
+        depth: ``(H, W)`` of the view, metres; 0 is infinitely far.
+        K, T_world_camera: Of the view.
+        K_then, T_then_world: Of the recorded camera; the second maps the world to it.
+        depth_then: ``(H', W')`` of the recorded frame.
+        T_box_world: ``(A, 4, 4)`` the world to each actor's box, at the view's time.
+        T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the actor was absent.
+        sizes: ``(A, 3)`` length, width and height, metres.
+
+    Returns:
+        Column and row ``(H, W)``, counted from the centre of the first pixel, and `HELD`, `DOUBTED` or 0 ``(H, W)``.
+    """
+    height, width = depth.shape
+    x, y, held = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    arrays = (np.ascontiguousarray(a, dtype=np.float64) for a in (K, T_world_camera, K_then, T_then_world, T_box_world, T_then_box, sizes))
+    _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, x, y, held)
+    return x, y, held
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _coordinates(depth, depth_then, K, T, K_then, T_then, T_box, T_then_box, sizes, x, y, held):
+    """Fill ``x``, ``y`` and ``held``; the loop of `plain_coordinates`."""
+    height, width = depth.shape
+    rows_then, columns_then = depth_then.shape
+    actors = sizes.shape[0]
+    for row in range(height):
+        for column in range(width):
+            z = np.float64(depth[row, column])
+            if not z > 0:
+                z = INFINITY_M
+            cx, cy = (column + 0.5 - K[0, 2]) / K[0, 0] * z, (row + 0.5 - K[1, 2]) / K[1, 1] * z
+            px = T[0, 0] * cx + T[0, 1] * cy + T[0, 2] * z + T[0, 3]
+            py = T[1, 0] * cx + T[1, 1] * cy + T[1, 2] * z + T[1, 3]
+            pz = T[2, 0] * cx + T[2, 1] * cy + T[2, 2] * z + T[2, 3]
+            lost = False
+            for a in range(actors):
+                B = T_box[a]
+                qz = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
+                if not -sizes[a, 2] / 2 + SOLE_M <= qz < sizes[a, 2] / 2 + AROUND_M[2]:
+                    continue
+                qx = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
+                qy = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
+                if abs(qx) >= sizes[a, 0] / 2 + AROUND_M[0] or abs(qy) >= sizes[a, 1] / 2 + AROUND_M[1]:
+                    continue
+                W = T_then_box[a]
+                lost = not np.isfinite(W[0, 0])
+                px = W[0, 0] * qx + W[0, 1] * qy + W[0, 2] * qz + W[0, 3]
+                py = W[1, 0] * qx + W[1, 1] * qy + W[1, 2] * qz + W[1, 3]
+                pz = W[2, 0] * qx + W[2, 1] * qy + W[2, 2] * qz + W[2, 3]
+                break
+            if lost:
+                continue
+            rz = T_then[2, 0] * px + T_then[2, 1] * py + T_then[2, 2] * pz + T_then[2, 3]
+            if not rz > NEAREST_M:
+                continue
+            rx = T_then[0, 0] * px + T_then[0, 1] * py + T_then[0, 2] * pz + T_then[0, 3]
+            ry = T_then[1, 0] * px + T_then[1, 1] * py + T_then[1, 2] * pz + T_then[1, 3]
+            u, v = rx / rz * K_then[0, 0] + K_then[0, 2], ry / rz * K_then[1, 1] + K_then[1, 2]
+            if not (0 <= u < columns_then and 0 <= v < rows_then):
+                continue
+            x[row, column], y[row, column] = u - 0.5, v - 0.5
+            there = np.float64(depth_then[int(v), int(u)])
+            if not there > 0:
+                there = INFINITY_M
+            far = there > INFINITY_M / 2 and rz > INFINITY_M / 2
+            held[row, column] = HELD if far or abs(there - rz) < SLACK * rz + SLACK_M else DOUBTED
+
+
+def plain_coordinates(
+    depth: F32, K: F64, T_world_camera: F64, K_then: F64, T_then_world: F64, depth_then: F32, T_box_world: F64, T_then_box: F64, sizes: F64
+) -> tuple[F32, F32, U8]:
+    """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
+    height, width = depth.shape
+    z = np.where(depth > 0, depth, INFINITY_M).astype(np.float64)
+    v, u = np.mgrid[:height, :width] + 0.5
+    points = _moved(T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1))
+    free: Bool = np.ones((height, width), dtype=bool)  # pixels that belong to no actor so far
+    there: Bool = np.ones((height, width), dtype=bool)  # pixels that are not of an actor that was absent
+    out = points.copy()
+    for T_box, T_then, size in zip(T_box_world, T_then_box, sizes, strict=True):
+        q = _moved(T_box, points)
+        inside = free & (np.abs(q[..., :2]) < size[:2] / 2 + np.array(AROUND_M[:2])).all(-1)
+        inside &= (q[..., 2] >= -size[2] / 2 + SOLE_M) & (q[..., 2] < size[2] / 2 + AROUND_M[2])
+        out[inside] = _moved(T_then, q[inside])
+        there[inside] = bool(np.isfinite(T_then).all())
+        free &= ~inside
+    local = _moved(T_then_world, out)
+    rz = local[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = local[..., 0] / rz * K_then[0, 0] + K_then[0, 2]
+        y = local[..., 1] / rz * K_then[1, 1] + K_then[1, 2]
+        rows, columns = depth_then.shape
+        seen = there & (rz > NEAREST_M) & (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    at = depth_then[np.where(seen, y, 0).astype(int), np.where(seen, x, 0).astype(int)]
+    then = np.where(at > 0, at, INFINITY_M)
+    far = (then > INFINITY_M / 2) & (rz > INFINITY_M / 2)
+    agrees = far | (np.abs(then - rz) < SLACK * rz + SLACK_M)
+    held = np.where(seen, np.where(agrees, HELD, DOUBTED), 0).astype(np.uint8)
+    return np.where(seen, x - 0.5, 0).astype(np.float32), np.where(seen, y - 0.5, 0).astype(np.float32), held
+
+
+def _moved(T: F64, points: F64) -> F64:
+    """Map points ``(..., 3)`` by ``T (4, 4)``."""
+    moved: F64 = points @ T[:3, :3].T + T[:3, 3]
+    return moved

@@ -1,0 +1,144 @@
+"""References of training episodes: recorded frames warped as in deployment, with the errors that real recordings have.
+
+A sequence of pairs has its recorded frames (`training.reference_store`). A recorded video has no depth: its own neighbouring frames stand for
+the recording, carried along by optical flow, which is then bent by a smooth error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.types import F32, F64, I64, U8, Box
+from alpasim_plugin.fixers.references import Picture, ReferenceIndex, warp
+from alpasim_plugin.fixers.warp_kernels import DOUBTED, HELD
+from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
+from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
+
+COUNTS = (0.10, 0.15, 0.45, 0.30)  # chance of 0, 1, 2, 3 references
+SLOTS = len(COUNTS) - 1
+P_SKIP, MOST_SKIPPED = 0.25, 2  # the nearest ones are missing
+P_MISPLACED, SHIFT_M, TURN_RAD = 0.35, 0.06, 0.004  # spread of the error of a recorded frame's pose
+P_EXPOSURE, EXPOSURE = 0.4, 0.08  # spread of the logarithm of a channel's gain
+P_WRONG = 0.04  # one of them is of another place
+FLOW_FRAMES = (2, 10)  # of a video: how far away the frames are that stand for the recording
+P_BENT, BENT_PX, BENT_CELL_PX = 0.7, 2.0, 24  # error of the flow, smooth over so many pixels
+CONSISTENT_PX = 1.0  # forward and backward flow agree within this: the neighbouring frame shows the same surface
+OPEN_SEQUENCES, PICTURES = 100, 64  # kept in memory
+
+
+@dataclass(frozen=True)
+class ReferenceDraw:
+    """What references the frames of an episode have.
+
+    Attributes:
+        count: How many.
+        skipped: So many of the nearest are missing.
+        errors: ``(SLOTS, 6)`` of the poses: shift in metres and axis-angle, in the camera's axes.
+        gains: ``(SLOTS, 3)`` of the channels.
+        wrong: Slot that shows another place; -1: none.
+        seed: Of what is drawn for single frames.
+    """
+
+    count: int
+    skipped: int
+    errors: F64
+    gains: F64
+    wrong: int
+    seed: int
+
+
+def draw_references(rng: np.random.Generator) -> ReferenceDraw:
+    """Draw the references of an episode."""
+    count = int(rng.choice(len(COUNTS), p=COUNTS))
+    skipped = int(rng.integers(1, MOST_SKIPPED + 1)) if rng.random() < P_SKIP else 0
+    spread = np.repeat([SHIFT_M, TURN_RAD], 3) * (rng.random() < P_MISPLACED)
+    errors = spread * rng.standard_normal((SLOTS, 6))
+    gains = np.exp(EXPOSURE * (rng.random() < P_EXPOSURE) * rng.standard_normal((SLOTS, 3)))
+    wrong = int(rng.integers(SLOTS)) if rng.random() < P_WRONG else -1
+    return ReferenceDraw(count, skipped, errors, gains, wrong, int(rng.integers(2**31)))
+
+
+def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, rows: slice, columns: slice) -> U8:
+    """Return the references of some frames of a sequence of pairs, cut to a crop: ``(T, SLOTS, h, w, 4)``; zero where there is none."""
+    out = np.zeros((len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8)
+    found = _opened(sequence)
+    if found is None or not draw.count:
+        return out
+    references, recorded, boxes = found
+    K = references.K.copy()
+    K[:2, 2] -= (columns.start, rows.start)
+    last: Sequence[int] = ()
+    for t, i in enumerate(index):
+        chosen = recorded.choose(references.T_world_camera[i], int(references.t_us[i]), draw.skipped + draw.count, last)
+        last = chosen
+        target = references.target(int(i), K, rows, columns)
+        for slot, j in enumerate(chosen[draw.skipped :]):
+            at = (j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j
+            out[t, slot] = warp(_misplaced(_picture(sequence, at), draw.errors[slot]), target, boxes)
+    return out
+
+
+def video_references(clip: PairClip, draw: ReferenceDraw, index: I64, rows: slice, columns: slice) -> U8:
+    """Return the same for a recorded video, whose neighbouring frames stand for the recording."""
+    out = np.zeros((len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8)
+    rng = np.random.default_rng(draw.seed)
+    away = rng.integers(*FLOW_FRAMES, SLOTS) * rng.choice([-1, 1], SLOTS)
+    bent = [_smooth(rng, clip.rgb_gt.shape[1:3]) if rng.random() < P_BENT else None for _ in range(SLOTS)]
+    for t, i in enumerate(index):
+        for slot in range(draw.count):
+            j = int(i) + int(away[slot])
+            if 0 <= j < len(clip):
+                out[t, slot] = _carried(clip.rgb_gt[i], clip.rgb_gt[j], bent[slot])[rows, columns]
+    return out
+
+
+def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
+    """Carry frame ``there`` to ``here`` by optical flow (Kroeger et al., 2016, DIS)."""
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # type: ignore[attr-defined]
+    grey = [cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (here, there)]
+    forward, backward = flow.calc(*grey, None), flow.calc(*grey[::-1], None)
+    height, width = grey[0].shape
+    place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    at = place + forward
+    back = cv2.remap(backward, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    agrees = np.linalg.norm(forward + back, axis=-1) < CONSISTENT_PX
+    seen = (at >= 0).all(-1) & (at[..., 0] <= width - 1) & (at[..., 1] <= height - 1)
+    at = at if bent is None else at + bent
+    out = np.empty((height, width, 4), np.uint8)
+    out[..., :3] = cv2.remap(np.ascontiguousarray(there), at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    out[..., 3] = np.where(seen, np.where(agrees, HELD, DOUBTED), 0)
+    return out
+
+
+def _smooth(rng: np.random.Generator, size: tuple[int, ...]) -> F32:
+    """Draw a smooth error of flow ``(H, W, 2)``, pixels."""
+    height, width = size
+    coarse = rng.standard_normal((height // BENT_CELL_PX + 2, width // BENT_CELL_PX + 2, 2)).astype(np.float32)
+    smooth: F32 = BENT_PX * rng.random(dtype=np.float32) * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return smooth
+
+
+def _misplaced(picture: Picture, error: F64) -> Picture:
+    if not error.any():
+        return picture
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(error[3:])[0], error[:3]
+    return Picture(picture.K, picture.T_world_camera @ T, picture.rgb, picture.depth, picture.actors)
+
+
+@lru_cache(maxsize=OPEN_SEQUENCES)
+def _opened(sequence: PairSequence) -> tuple[SequenceReferences, ReferenceIndex, dict[str, Box]] | None:
+    found = open_references(sequence)
+    return None if found is None else (found, found.index(), found.sizes())
+
+
+@lru_cache(maxsize=PICTURES)
+def _picture(sequence: PairSequence, i: int) -> Picture:
+    found = _opened(sequence)
+    assert found is not None
+    return found[0].picture(i)

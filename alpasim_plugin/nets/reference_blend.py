@@ -1,0 +1,104 @@
+"""What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
+
+    f_k       = act(H (fine + E_k))                                 E_k: what reference k shows beside the render; H is shared
+    w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
+    x_k       = ref_k(p + 8 px tanh d) + c                          the reference, moved by a learned offset
+    p_0..p_K  = softmax(0, w_k + log v_k(p + 8 px tanh d))          v_k: where reference k holds
+    x         = p_0 (render + residual) + sum_k p_k x_k
+
+All references share one set of weights, so their number and order are free; without any, p_0 is 1 and the generator is the one without
+references. A warp that is wrong costs nothing where the network gives it no weight.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.nets.pixel_layers import Conv3, activation, cells, pixels
+
+CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
+CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
+OFFSET_PX = 8.0  # largest learned offset
+NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
+DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
+
+
+class ReferenceBlend(nn.Module):
+    """Read references and blend them with the generator's own picture.
+
+    Args:
+        coarse: Channels of the generator at 1/4.
+        detail: Channels of its detail path.
+        width: Channels of the blending head.
+    """
+
+    def __init__(self, coarse: int, detail: int, width: int) -> None:
+        super().__init__()
+        self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
+        self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
+        self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
+        self.head = Conv3(detail, width)
+        self.write = Conv3(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        for weight in (self.stem.weight, self.read.weight, self.write.weight):
+            nn.init.zeros_(weight)
+        assert self.write.bias is not None
+        nn.init.zeros_(self.write.bias)
+        with torch.no_grad():
+            self.write.bias[: DETAIL**2] = DOUBT
+
+    def features(self, beside: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the references add to the generator's first layers.
+
+        Args:
+            beside: ``(B, K, H, W, 4)`` from `beside_render`.
+
+        Returns:
+            ``(B, H / 4, W / 4, coarse)`` and ``(B, H / 2, W / 2, detail)``: means over the references.
+        """
+        mean = beside.mean(dim=1).to(self.stem.weight.dtype)
+        return self.stem(cells(mean, CELL)), self.read(cells(mean, DETAIL))
+
+    def forward(self, fine: Tensor, render: Tensor, repaired: Tensor, references: Tensor, beside: Tensor) -> tuple[Tensor, Tensor]:
+        """Blend.
+
+        Args:
+            fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
+            render: ``(B, H, W, 3)`` in [-1, 1].
+            repaired: ``(B, H, W, 3)`` render plus residual.
+            references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
+            beside: ``(B, K, H, W, 4)`` from `beside_render`.
+
+        Returns:
+            ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
+        """
+        b, k, h, w, _ = references.shape
+        own = self.own(cells(beside.flatten(0, 1).to(fine.dtype), DETAIL))
+        joined = fine[:, None].expand(b, k, *fine.shape[1:]).flatten(0, 1) + own
+        said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
+        weight, offset, correction = said.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
+        moved = _sampled(references.flatten(0, 1), torch.tanh(offset) * OFFSET_PX)
+        colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
+        holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
+        logits = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
+        shares = torch.cat([torch.zeros_like(logits[:, :1]), logits], dim=1).softmax(dim=1)
+        out = shares[:, 0] * repaired + (shares[:, 1:] * colour).sum(dim=1)
+        return out, 1 - shares[:, 0]
+
+
+def beside_render(references: Tensor, render: Tensor) -> Tensor:
+    """Return what the network reads of references: ``(ref - render) v`` and ``v``, ``(B, K, H, W, 4)``."""
+    holds = references[..., 3:]
+    return torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
+
+
+def _sampled(images: Tensor, offset: Tensor) -> Tensor:
+    """Look images ``(N, H, W, 4)`` up at offsets ``(N, H / 2, W / 2, 2)``, x and y in pixels; beyond the border the outermost pixels go on."""
+    n, h, w, _ = images.shape
+    full = F.interpolate(offset.permute(0, 3, 1, 2), scale_factor=DETAIL, mode="bilinear", align_corners=False)
+    columns = torch.arange(w, device=images.device) + 0.5
+    rows = torch.arange(h, device=images.device)[:, None] + 0.5
+    grid = torch.stack([(columns + full[:, 0]) * (2 / w) - 1, (rows + full[:, 1]) * (2 / h) - 1], dim=-1)
+    sampled = F.grid_sample(images.permute(0, 3, 1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled.permute(0, 2, 3, 1)
