@@ -84,5 +84,5 @@ def draw_and_gather() -> None:
     car = ActorBox(se2(5.0, 0.0, 0.0, 0.8), Box(4.5, 1.9, 1.6), "car")
     draw_map(prepare_map(LaneMap({}, road_edges=(edge,))), camera, ahead, [car], threads=1)
     image = torch.zeros(1, side_px, side_px, 3)
-    state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image)
+    state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image, image[..., :1])
     gather_cells_cpu(image, image[..., :1], image, state, image + 1)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.core.installed import installed
-from alpasim_plugin.core.types import U8, Actor, Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.plugins.parts import complete
@@ -44,6 +45,7 @@ class BlockRunner:
         render_base: The base renderer; its frames are checked.
         scene_map: The scene's map, or None where the fixer uses none.
         actors: The scenario's, for the sizes of their boxes.
+        references: Warps recorded frames into each view; None where the fixer reads none, or the renderer declares none.
         threads: Threads of the map rasteriser.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
@@ -52,6 +54,7 @@ class BlockRunner:
     scene_map: PreparedMap | None
     actors: Sequence[Actor]
     threads: int | None = None
+    references: ReferenceSession | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     def reset_times(self) -> None:
@@ -59,8 +62,11 @@ class BlockRunner:
         self.stage_ms = dict.fromkeys(self.stage_ms, 0.0)
 
     def render(self, request: RenderRequest) -> ConditionedFrame:
-        """Render one frame and draw its map."""
+        """Render one frame, warp its references and draw its map."""
         frame = self.render_base(request)
+        if self.references is not None:
+            with self._timed("references"):
+                frame = replace(frame, references=self.references.of(request, frame))
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
         with self._timed("map"):
@@ -93,7 +99,7 @@ class BlockRunner:
         problem = _problem(frames, fixed)
         if problem:
             raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")
-        return fixed
+        return [replace(frame, references=()) for frame in fixed]
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
@@ -165,6 +171,7 @@ def fixed_renderer(
     settings: FixerSettings,
     scenario: Scenario,
     threads: int | None = None,
+    recorded: Sequence[RecordedFrame] = (),
 ) -> Renderer:
     """Return one rollout's renderer whose frames are fixed.
 
@@ -177,12 +184,16 @@ def fixed_renderer(
         settings: Mode, tolerances, and whether the fixer wants semantic maps.
         scenario: Its map and its actors' boxes are what the semantic map shows.
         threads: Threads of the map rasteriser; None leaves numba's number.
+        recorded: Frames of the recorded drive that the base renderer declares.
 
     Raises:
         InputError: No installed package has the mode.
     """
     scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
-    runner = BlockRunner(render, scene_map, scenario.actors, threads)
+    references = None
+    if settings.references and recorded:
+        references = ReferenceSession(recorded, scenario.actors, settings.references, settings.recording)
+    runner = BlockRunner(render, scene_map, scenario.actors, threads, references)
 
     def make() -> Fixer:
         return complete(make_fixer(), Fixer)

@@ -28,6 +28,8 @@ from alpasim_plugin.nets.pixel_source import content_key, pixel_noise, sparse_so
 from alpasim_plugin.nets.schedule import from_names, interpolant
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
+RECORDED = "recorded_share"  # fact of a frame: how much of the picture its references are, 0 to 1
+
 
 @dataclass(frozen=True)
 class PixelInputs:
@@ -36,6 +38,7 @@ class PixelInputs:
     render: Tensor  # (B, H, W, 3) in [-1, 1]
     opacity: Tensor  # (B, H, W, 1), 0 to 1
     sdmap: Tensor  # (B, H, W, 3) in [-1, 1]; black where there is no map
+    references: Tensor | None = None  # (B, K, H, W, 4) colour in [-1, 1], and where it holds, 0 to 1
 
 
 @torch.inference_mode()
@@ -60,13 +63,14 @@ def fix_frame(
     """
     render = inputs.render
     images = render, inputs.opacity, inputs.sdmap, state
-    out, after = generator.step(*images, source(0))
+    out, after = generator.step(*images, source(0), inputs.references)
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
         t = level.sigma
-        out, after = generator.net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t))
+        out, after = generator.net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t), inputs.references)
     if settings.keep_render:
         share = render_share(out, render, inputs.opacity, inputs.sdmap, state.output)
         if share is not None:
+            share = share * (1 - after.recorded)  # a recorded frame is evidence of its own
             out = torch.lerp(out, render, share)
             after = after._replace(output=out.clamp(-1, 1))
     return out, after
@@ -162,8 +166,10 @@ class PixelFixer(Fixer):
         out, after = list(block), dict(pasts)
         for view in views:
             for camera, index, made, event in self._fix(view, pasts):
-                i = index[0]
-                out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=made.fixed)
+                frame = replace(block[index[0]], references=())
+                if view.references is not None:
+                    frame = replace(frame, facts={**frame.facts, RECORDED: float(made.state.recorded.mean())})
+                out[index[0]] = replace(frame, events=(*frame.events, event)) if event else replace(frame, rgb=made.fixed)
                 after[camera] = made
         return tuple(out), after
 
@@ -215,4 +221,9 @@ def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:
     render = image(view.rgb[:, 0]).float().div_(HALF).sub_(1)
     opacity = torch.ones_like(render[..., :1]) if view.alpha is None else image(view.alpha[:, 0, ..., None])
     sdmap = torch.full_like(render, -1.0) if view.maps is None else image(view.maps[:, 0]).float().div_(HALF).sub_(1)
-    return PixelInputs(render, opacity, sdmap)
+    references = None
+    if view.references is not None:
+        padded = np.pad(view.references[:, 0], ((0, 0), (0, 0), (0, below), (0, right), (0, 0)))
+        references = torch.from_numpy(padded).to(device).float().mul_(1 / HALF).sub_(1)
+        references[..., 3:].add_(1).mul_(0.5)
+    return PixelInputs(render, opacity, sdmap, references)

@@ -10,7 +10,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import torch
@@ -61,7 +61,7 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     else:
         net, trained, note = _untrained(settings), False, f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
-    step = RecordedStep(net) if device == "cpu" else net
+    step = RecordedStep(net) if device == "cpu" else partial(_step_on, net)
     return LoadedGenerator(net, step, trained, note, precision, torch.device(device))
 
 
@@ -77,6 +77,14 @@ def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
     return net
 
 
+def _step_on(
+    net: PixelGenerator, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, references: Tensor | None = None
+) -> tuple[Tensor, PixelState]:
+    """Call a generator at t = 1 on another device."""
+    out: tuple[Tensor, PixelState] = net(render, opacity, sdmap, state, source, None, references)
+    return out
+
+
 class RecordedStep:
     """Call a generator on the CPU at t = 1; equal to calling the network, to rounding.
 
@@ -90,10 +98,13 @@ class RecordedStep:
         self._calls: Counter[tuple[int, ...]] = Counter()
         self.recorded: dict[tuple[int, ...], Any] = {}
 
-    def __call__(self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor) -> tuple[Tensor, PixelState]:
+    def __call__(
+        self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, references: Tensor | None = None
+    ) -> tuple[Tensor, PixelState]:
         """Return the clean frame and the state after it; see `PixelGenerator.forward`."""
-        tensors = *gather_cells_cpu(render, opacity, sdmap, state, source), render, *state
-        shape = tuple(render.shape)
+        read = () if references is None or self._step.net.blend is None else (references,)
+        tensors = *gather_cells_cpu(render, opacity, sdmap, state, source), render, *state, *read
+        shape = *render.shape, *(images.shape[1] for images in read)
         self._calls[shape] += 1
         if self._after is not None and shape not in self.recorded and self._calls[shape] > self._after:
             self.recorded[shape] = _record(self._step, tensors)
@@ -108,8 +119,10 @@ class _Step(nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(self, coarse: Tensor, fine: Tensor, render: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        out, after = self.net.from_cells(GatheredCells(coarse, fine), render, PixelState(*state))
+    def forward(self, coarse: Tensor, fine: Tensor, render: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+        kept = len(PixelState._fields)
+        references = others[kept] if len(others) > kept else None
+        out, after = self.net.from_cells(GatheredCells(coarse, fine), render, PixelState(*others[:kept]), None, references)
         return (out, *after)
 
 

@@ -35,7 +35,7 @@ class PixelSizesSettings(Part):
     blend: int = Field(default=0, ge=0, description="Channels of the head that blends references with the picture; 0: none are read.")
 
 
-PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map"))
+PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map", "references", "recording"))
 
 
 class PixelFixerSettings(WeightedSettings):

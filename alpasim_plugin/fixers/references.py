@@ -1,8 +1,8 @@
-"""Recorded frames as references of a fixer: which of them a frame is given, and how they are warped into its view.
+"""Recorded frames as references of a fixer: which of them a frame is given. `fixers.warp` carries them into its view.
 
-Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph, carried into the view by the render's own
-depth and by the poses that the reconstruction believes; pixels of a road user move with its box. Both are as wrong as the reconstruction is,
-so a fixer is told where a reference holds and decides by itself what to take of it.
+Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph, carried into the view by the render's
+own depth and by the poses that the reconstruction believes; pixels of a road user move with its box. Both are as wrong as the
+reconstruction is, so a fixer is told where a reference holds and decides by itself what to take of it.
 
 A recording is known in full before a rollout begins: frames that were recorded after the present time are references as well, unless
 ``past`` asks for earlier ones alone. Nothing of the rollout's own future is looked at.
@@ -11,19 +11,15 @@ A recording is known in full before a rollout begins: frames that were recorded 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Literal
 
-import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, I64, U8, Actor, Box, Frame, RecordedFrame, RenderRequest
-from alpasim_plugin.fixers.warp_kernels import warp_coordinates
+from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, warp
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
-HELD, DOUBTED = 255, 128  # last channel of a reference: the recorded frame shows this surface; it shows the place, at another depth
 SECOND_M, TURN_M = 0.5, 10.0  # a second apart counts as so many metres, and so does a view that is turned by a radian
 FARTHEST_M = 25.0  # a recorded frame from farther away is no reference
 STAY = 0.75  # the distance of a frame that the last picture had counts as this share of it, so that references do not flicker
@@ -69,64 +65,6 @@ class ReferenceIndex:
         return tuple(int(i) for i in order if usable[i])
 
 
-@dataclass(frozen=True, eq=False)
-class WarpTarget:
-    """The view that references are warped into.
-
-    Attributes:
-        K: ``(3, 3)`` pixels.
-        T_world_camera: ``(4, 4)``.
-        depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as infinitely far.
-        actors: ``T_world_box`` of the actors present.
-    """
-
-    K: F64
-    T_world_camera: F64
-    depth: F32
-    actors: Mapping[str, F64]
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A recorded frame in memory: see `RecordedFrame`."""
-
-    K: F64
-    T_world_camera: F64
-    rgb: U8
-    depth: F32
-    actors: Mapping[str, F64]
-
-
-def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
-    """Carry a recorded frame into a view by the view's depth.
-
-    A pixel's surface point is moved with the box it lies in, from where the actor is now to where it was when the frame was recorded, and
-    looked up there, between pixels bicubically.
-
-    Args:
-        picture: The recorded frame.
-        target: The view.
-        boxes: Sizes of the actors.
-
-    Returns:
-        ``(H, W, 4)`` uint8: colour, and `HELD` where the recorded frame's own depth agrees with the point, `DOUBTED` where it does not
-        (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to an
-        actor that was not there.
-    """
-    now = [name for name in sorted(target.actors) if name in boxes]
-    T_box_world = np.array([inverse(target.actors[name]) for name in now]).reshape(-1, 4, 4)
-    then = [picture.actors.get(name) for name in now]
-    T_then_box = np.array([np.full((4, 4), np.nan) if T is None else T for T in then]).reshape(-1, 4, 4)
-    sizes = np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
-    x, y, held = warp_coordinates(
-        target.depth, target.K, target.T_world_camera, picture.K, inverse(picture.T_world_camera), picture.depth, T_box_world, T_then_box, sizes
-    )
-    out = np.empty((*held.shape, 4), np.uint8)
-    out[..., :3] = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    out[..., 3] = held
-    return out
-
-
 class ReferenceSession:
     """The references of one rollout's frames.
 
@@ -135,12 +73,19 @@ class ReferenceSession:
         actors: The scenario's, for the sizes of their boxes.
         count: References of a frame, at most.
         which: ``all`` of the recording, or only what was recorded before the frame's time.
+        holds_on: Whether a camera keeps its references a little longer than they are nearest. Without it a view's references do not depend
+            on what came before, as a server of several drives needs.
     """
 
     def __init__(
-        self, recorded: Sequence[RecordedFrame], actors: Sequence[Actor], count: int, which: Literal["all", "past"] = "all"
+        self,
+        recorded: Sequence[RecordedFrame],
+        actors: Sequence[Actor],
+        count: int,
+        which: Literal["all", "past"] = "all",
+        holds_on: bool = True,
     ) -> None:
-        self.index, self.count, self.past = ReferenceIndex(recorded), count, which == "past"
+        self.index, self.count, self.past, self.holds_on = ReferenceIndex(recorded), count, which == "past", holds_on
         self._boxes = {actor.actor_id: actor.box for actor in actors}
         self._last: dict[str, tuple[int, ...]] = {}
         self._pictures: OrderedDict[int, Picture] = OrderedDict()
@@ -157,7 +102,8 @@ class ReferenceSession:
         T_world_camera = request.T_world_camera[-1]
         last = self._last.get(frame.camera, ())
         chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
-        self._last[frame.camera] = chosen
+        if self.holds_on:
+            self._last[frame.camera] = chosen
         target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors)
         return tuple(warp(self._picture(i), target, self._boxes) for i in chosen)
 

@@ -59,6 +59,10 @@ class FixerSettings(Part):
     tolerance_m: float = Field(default=0.02, ge=0, description="Speculative: largest camera displacement from the predicted pose.")
     tolerance_deg: float = Field(default=0.1, ge=0, description="Speculative: largest camera rotation from the predicted pose.")
     uses_map: bool = Field(default=False, description="Whether the semantic map is drawn and given to the fixer.")
+    references: int = Field(default=0, ge=0, le=8, description="Recorded frames that are warped into each view, at most; 0: none.")
+    recording: Literal["all", "past"] = Field(
+        default="all", description="Which recorded frames may be references: all of the recording, or those from before the frame's time."
+    )
 
     @property
     def loop_mode(self) -> str:

@@ -29,6 +29,7 @@ class Views:
     rgb: U8  # (B, T, H, W, 3)
     alpha: F32 | None  # (B, T, H, W), 0 to 1; None where every pixel is opaque
     maps: U8 | None  # (B, T, H, W, 3)
+    references: U8 | None = None  # (B, T, K, H, W, 4) recorded frames, 0 where a frame has fewer than others; None: no frame has any
 
     @property
     def size(self) -> ClipSize:
@@ -123,6 +124,10 @@ def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> Non
             raise InputError(DOING, what, f"rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)", do)
         if frame.alpha is not None:
             _check_alpha(what, frame.alpha, shape[:2])
+        for image in frame.references:
+            if image.shape != (*shape[:2], 4) or image.dtype != np.uint8:
+                found = f"a reference of {image.dtype} {image.shape}"
+                raise InputError(DOING, what, found, f"give uint8 {(*shape[:2], 4)}, the size of the frame")
     for t_us, image in zip(times, maps, strict=False):
         if image.shape != shape or image.dtype != np.uint8:
             found = f"{image.dtype} {image.shape}"
@@ -156,7 +161,19 @@ def _stack(block: Sequence[Frame], maps: Sequence[U8], cameras: Sequence[str], i
         np.stack([frame.rgb for frame in frames]).reshape(*lead, *shape),
         alpha,
         np.stack([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
+        _references(frames, lead),
     )
+
+
+def _references(frames: Sequence[Frame], lead: tuple[int, int]) -> U8 | None:
+    count = max(len(frame.references) for frame in frames)
+    if not count:
+        return None
+    out = np.zeros((len(frames), count, *frames[0].rgb.shape[:2], 4), np.uint8)
+    for i, frame in enumerate(frames):
+        for k, image in enumerate(frame.references):
+            out[i, k] = image
+    return out.reshape(*lead, *out.shape[1:])
 
 
 def _same(a: object, b: object) -> bool:

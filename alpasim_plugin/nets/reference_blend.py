@@ -94,8 +94,8 @@ def beside_render(references: Tensor, render: Tensor) -> Tensor:
 
 
 def _sampled(images: Tensor, offset: Tensor) -> Tensor:
-    """Look images ``(N, H, W, 4)`` up at offsets ``(N, H / 2, W / 2, 2)``, x and y in pixels; beyond the border the outermost pixels go on."""
-    n, h, w, _ = images.shape
+    """Look images ``(N, H, W, 4)`` up at offsets ``(N, H / 2, W / 2, 2)``, x and y in pixels; beyond the border the outermost go on."""
+    h, w = images.shape[1:3]
     full = F.interpolate(offset.permute(0, 3, 1, 2), scale_factor=DETAIL, mode="bilinear", align_corners=False)
     columns = torch.arange(w, device=images.device) + 0.5
     rows = torch.arange(h, device=images.device)[:, None] + 0.5

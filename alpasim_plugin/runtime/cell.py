@@ -277,4 +277,5 @@ def make_renderer(
     def render(request: RenderRequest) -> Frame:
         return checked_frames(base, [request])[0]
 
-    return fixed_renderer(render, lambda: build(fixer, scene_id=scenario.scene_id, **session), settings, scenario, threads)
+    recorded = base.recorded() if settings.references else ()
+    return fixed_renderer(render, lambda: build(fixer, scene_id=scenario.scene_id, **session), settings, scenario, threads, recorded)

@@ -18,8 +18,9 @@ def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Te
 
     render, sdmap, output, last = (image(height, width, 3) for _ in range(4))
     state = PixelState(
-        output, last, image(height // 4, width // 4, hidden), render.new_zeros(batch, 0, 1, 0), render.new_zeros(batch, 1, 1, 1)
-    )
+        output, last, image(height // 4, width // 4, hidden), render.new_zeros(batch, 0, 1, 0), render.new_zeros(batch, 1, 1, 1),
+        render.new_zeros(batch, height, width, 1),
+    )  # fmt: skip
     return render, image(height, width, 1).abs(), sdmap, state
 
 

@@ -8,17 +8,20 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.alpasim.server.status import UnknownScene
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import U8, Frame, Scenario
+from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.references import ReferenceSession
+from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.log.schema import wire_camera
 from alpasim_plugin.plugins.interfaces import BlockRule, Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
+from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.wire import FRONT_WIDE, sensorsim_pb2
 from scenarios.load import load_scenario
@@ -103,11 +106,18 @@ def size_of(value: Any) -> int:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A loaded scene: the scenario, its prepared map, and its renderer where the server renders itself."""
+    """A loaded scene: the scenario, its prepared map, its renderer where the server renders itself, and its recorded frames, if any."""
 
     scenario: Scenario
     scene_map: PreparedMap | None
     renderer: Renderer | None
+    references: ReferenceSession | None = None
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render a frame with its references, which depend on the request alone."""
+        assert self.renderer is not None, "scenes without a renderer are for maps only"
+        frame = checked_frames(self.renderer, [request])[0]
+        return frame if self.references is None else replace(frame, references=self.references.of(request, frame))
 
 
 class SceneCache:
@@ -174,10 +184,15 @@ class SceneCache:
 
     def _load(self, source: str | Path) -> SceneEntry:
         scenario = load_scenario(source)
-        renderer = None
+        renderer, references = None, None
         if self._spec is not None:
             renderer = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
-        return SceneEntry(scenario, prepare_map(scenario.lane_map) if self._needs_map else None, renderer)
+            settings = self._spec.fixer and self._spec.fixer.settings
+            recorded = renderer.recorded() if isinstance(settings, FixerSettings) and settings.references else ()
+            if recorded:
+                assert isinstance(settings, FixerSettings)
+                references = ReferenceSession(recorded, scenario.actors, settings.references, settings.recording, holds_on=False)
+        return SceneEntry(scenario, prepare_map(scenario.lane_map) if self._needs_map else None, renderer, references)
 
     def _enter(self, source: str | Path) -> None:
         scene_id = usdz_scene_id(source) if str(source).endswith(".usdz") else load_scenario(source).scene_id

@@ -29,7 +29,6 @@ from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderReq
 from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
-from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import actor_boxes
 from alpasim_plugin.wire import sensorsim_pb2
@@ -142,11 +141,10 @@ class LocalSource:
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
         lens = read_lens(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id)
-        assert entry.renderer is not None, "scenes without a renderer are for maps only"
         camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
         asked = RenderRequest(view.t_us, camera, view.T_world_camera, boxes_at(entry, view))
         with left.holding(self._busy):
-            frame = checked_frames(entry.renderer, [asked])[0]
+            frame = entry.render(asked)
             sdmap = drawn_map(entry, view, lens, camera, self._threads)
         return Rendered(lens.frame(frame), sdmap)
 

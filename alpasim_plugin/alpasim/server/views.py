@@ -142,7 +142,8 @@ class Lens:
     def frame(self, covering: Frame) -> Frame:
         """Return a covering frame as the lens shows it; where the lens sees nothing it is black and opaque."""
         alpha = None if covering.alpha is None else self.plane(covering.alpha, 1.0)
-        return replace(covering, rgb=self.image(covering.rgb), alpha=alpha, depth=None)
+        references = tuple(self.image(image) for image in covering.references)
+        return replace(covering, rgb=self.image(covering.rgb), alpha=alpha, depth=None, references=references)
 
     def image(self, covering: U8) -> U8:
         """Return the lens's picture ``(height, width, 3)`` of a covering one; black where it sees nothing."""

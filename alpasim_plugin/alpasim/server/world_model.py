@@ -31,7 +31,6 @@ from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
 from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.io.reading.images import check_image
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.wire import common_pb2, video_model_pb2
@@ -190,9 +189,7 @@ class WorldModel(Failures):
             sdmap = lens.image(draw_map(scene_map, pinhole, pose, actor_boxes(boxes, entry.scenario.actors), threads=self._threads))
         if not session.with_rgb:
             return sdmap, sdmap
-        assert entry.renderer is not None, "the video-model service renders itself"
-        frame = checked_frames(entry.renderer, [RenderRequest(t_us, pinhole, np.stack([pose, pose]), boxes)])[0]
-        frame = lens.frame(frame)
+        frame = lens.frame(entry.render(RenderRequest(t_us, pinhole, np.stack([pose, pose]), boxes)))
         if self._fixers is None:
             return frame.rgb, sdmap
         fixer = self._fixers.of(session.scene_id, session.seed)

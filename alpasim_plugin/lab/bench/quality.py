@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.warp import HELD
 from alpasim_plugin.lab.bench.map_error import MapShift
+from alpasim_plugin.lab.training.reference_store import SequenceReferences
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
@@ -22,6 +24,7 @@ from alpasim_plugin.plugins.interfaces import Fixer
 from alpasim_plugin.plugins.parts import PartSpec
 
 RAW = "3dgs"  # the variant of the unfixed render
+NEAREST = "nearest"  # the nearest recorded frame, warped without a network, and the render where that does not hold
 VERSION = 2  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
@@ -38,11 +41,18 @@ class QualityClip:
     opacity: U8  # (T, H, W), 255 is opaque
     sdmap: U8  # (T, H, W, 3)
     t_us: I64  # (T,)
+    recorded: SequenceReferences | None = None
 
     def first(self, frames: int) -> QualityClip:
         """Return the clip's first frames, all of them where it has fewer."""
-        cut = {name: getattr(self, name)[:frames] for name in ("render", "truth", "opacity", "sdmap", "t_us")}
-        return QualityClip(self.name, self.identity, **cut)
+        return replace(self, **{name: getattr(self, name)[:frames] for name in ("render", "truth", "opacity", "sdmap", "t_us")})
+
+    def references(self, count: int, past: bool = False) -> Iterator[tuple[U8, ...]]:
+        """Yield the references of every frame, at most ``count`` each."""
+        if self.recorded is None or not count:
+            yield from ((),) * len(self.t_us)
+        else:
+            yield from self.recorded.warped(len(self.t_us), count, past)
 
 
 @dataclass(frozen=True)
@@ -54,8 +64,9 @@ class Variant:
     map_shift: MapShift | None = None  # None: the map as it is
 
     def __post_init__(self) -> None:
-        if self.spec is None and self.label not in (RAW, TRUTH):
-            raise InputError("choosing what to measure", f"variant {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
+        if self.spec is None and self.label not in (RAW, NEAREST, TRUTH):
+            do = f"name a fixer, or {RAW}, {NEAREST}, {TRUTH}"
+            raise InputError("choosing what to measure", f"variant {self.label!r}", "no fixer", do)
 
     def content(self) -> dict[str, Any]:
         """Return everything that determines its images."""
@@ -111,9 +122,10 @@ def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> Var
             "give a session exactly for a fixer's variant",
         )
     if fixer is None or variant.spec is None or not isinstance(variant.spec.settings, FixerSettings):
-        return VariantResult(np.array(clip.truth if variant.label == TRUTH else clip.render), (), {})
+        shown = {RAW: clip.render, TRUTH: clip.truth}.get(variant.label)
+        return VariantResult(_nearest(clip) if shown is None else np.array(shown), (), {})
     tally, frames = StreamStats(), []
-    for block in refine_frames(_frames(clip, variant.spec.settings.uses_map), fixer):
+    for block in refine_frames(_frames(clip, variant.spec.settings), fixer):
         tally.add(block)
         frames += [frame.rgb for frame in block.fixed]
     return VariantResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
@@ -137,7 +149,18 @@ def measure(clip: QualityClip, variant: Variant, result: VariantResult, seed: in
     }
 
 
-def _frames(clip: QualityClip, with_map: bool) -> Iterator[tuple[Frame, U8 | None]]:
-    for i, t_us in enumerate(clip.t_us):
+def _nearest(clip: QualityClip) -> U8:
+    out = np.array(clip.render)
+    for frame, references in zip(out, clip.references(1), strict=True):
+        for image in references:
+            held = image[..., 3] == HELD
+            frame[held] = image[held, :3]
+    return out
+
+
+def _frames(clip: QualityClip, settings: FixerSettings) -> Iterator[tuple[Frame, U8 | None]]:
+    recorded = clip.references(settings.references, settings.recording == "past")
+    for i, (t_us, references) in enumerate(zip(clip.t_us, recorded, strict=True)):
         alpha = clip.opacity[i].astype(np.float32) / np.float32(255)
-        yield Frame(int(t_us), CAMERA, np.array(clip.render[i]), alpha), np.array(clip.sdmap[i]) if with_map else None
+        frame = Frame(int(t_us), CAMERA, np.array(clip.render[i]), alpha, references=references)
+        yield frame, np.array(clip.sdmap[i]) if settings.uses_map else None

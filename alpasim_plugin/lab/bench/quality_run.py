@@ -25,6 +25,7 @@ from alpasim_plugin.lab.bench.quality import QualityClip, Variant, measure, row_
 from alpasim_plugin.lab.learned_metrics.table import judged_markdown
 from alpasim_plugin.lab.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.lab.training.pair_store import CONTENT, PairSequence
+from alpasim_plugin.lab.training.reference_store import open_references
 from alpasim_plugin.lab.training.seen_scene import scene_of
 from alpasim_plugin.lab.video_metrics.charts import plot_by_frame, plot_speed
 from alpasim_plugin.lab.video_metrics.dists import HEADS_SHA256 as DISTS_HEADS
@@ -291,7 +292,8 @@ def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip
     clip = sequence.clip
     facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
     if given == "render":
-        return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
+        recorded = open_references(sequence)
+        return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us, recorded)
     render, opacity = clip.rgb_gt, np.full_like(clip.opacity, 255)
     if given == "lost-resolution":
         render, opacity = lose_resolution(clip.rgb_gt, sequence.name)

@@ -1,7 +1,7 @@
 """References of training episodes: recorded frames warped as in deployment, with the errors that real recordings have.
 
-A sequence of pairs has its recorded frames (`training.reference_store`). A recorded video has no depth: its own neighbouring frames stand for
-the recording, carried along by optical flow, which is then bent by a smooth error.
+A sequence of pairs has its recorded frames (`training.reference_store`). A recorded video has no depth: its own neighbouring frames stand
+for the recording, carried along by optical flow, which is then bent by a smooth error.
 """
 
 from __future__ import annotations
@@ -13,14 +13,16 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, U8, Box
-from alpasim_plugin.fixers.references import Picture, ReferenceIndex, warp
-from alpasim_plugin.fixers.warp_kernels import DOUBTED, HELD
+from alpasim_plugin.fixers.references import ReferenceIndex
+from alpasim_plugin.fixers.warp import DOUBTED, HELD, Picture, warp
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 
 COUNTS = (0.10, 0.15, 0.45, 0.30)  # chance of 0, 1, 2, 3 references
 SLOTS = len(COUNTS) - 1
+USUAL_REFERENCES = 2  # of a bundle's settings; the number is free
 P_SKIP, MOST_SKIPPED = 0.25, 2  # the nearest ones are missing
 P_MISPLACED, SHIFT_M, TURN_RAD = 0.35, 0.06, 0.004  # spread of the error of a recorded frame's pose
 P_EXPOSURE, EXPOSURE = 0.4, 0.08  # spread of the logarithm of a channel's gain
@@ -86,7 +88,7 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
 def video_references(clip: PairClip, draw: ReferenceDraw, index: I64, rows: slice, columns: slice) -> U8:
     """Return the same for a recorded video, whose neighbouring frames stand for the recording."""
     out = np.zeros((len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8)
-    rng = np.random.default_rng(draw.seed)
+    rng = stream("training", draw.seed, "references.video")
     away = rng.integers(*FLOW_FRAMES, SLOTS) * rng.choice([-1, 1], SLOTS)
     bent = [_smooth(rng, clip.rgb_gt.shape[1:3]) if rng.random() < P_BENT else None for _ in range(SLOTS)]
     for t, i in enumerate(index):

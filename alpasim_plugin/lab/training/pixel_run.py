@@ -14,6 +14,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, save_bundle
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.lab.training.episode_references import USUAL_REFERENCES
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.lab.training.model_card import ModelCard, curves
 from alpasim_plugin.lab.training.pixel_rollout import Distance
@@ -125,7 +126,10 @@ def sizes_of(settings: PixelFixerSettings) -> PixelSizes:
 
 def write_bundle(run: PixelRun, path: Path, weights: Mapping[str, Tensor], updates: int) -> Path:
     """Write averaged weights as a float16 bundle."""
-    settings = run.settings.model_copy(update={"uses_map": run.variant.use_map, "steps": (1000.0,), "holes": run.variant.holes})
+    trained_at = {"uses_map": run.variant.use_map, "steps": (1000.0,), "holes": run.variant.holes}
+    if run.settings.generator.blend:
+        trained_at |= {"references": USUAL_REFERENCES}
+    settings = run.settings.model_copy(update=trained_at)
     tensors: dict[str, Any] = {key: half(value) for key, value in weights.items()}
     named = "" if run.variant.name == DEPLOYED else f"{run.variant.name}, "
     save_bundle(path, {"generator": tensors}, settings, trained=True, note=f"{named}{updates} updates")

@@ -1,16 +1,16 @@
 """The recorded frames of a sequence of training pairs, beside its channels, and what carries them into a frame's view.
 
-    ROOT/SPLIT/SEQUENCE/depth.npy                (T, H, W)    float16  metres as the render sees it; 0 where no surface is
-                        actors.npy               (T, A, 4, 4) float64  T_world_box of every frame; NaN where an actor is absent
-                        boxes.npy                (A, 3)       float64  length, width, height, metres
-                        references/rgb.npy       (R, H, W, 3) uint8    recorded frames
-                        references/depth.npy     (R, H, W)    float16  as the renderer sees it from their believed poses
-                        references/T_world_camera.npy, t_us.npy, actors.npy
+ROOT/SPLIT/SEQUENCE/depth.npy                (T, H, W)    float16  metres as the render sees it; 0 where no surface is
+                    actors.npy               (T, A, 4, 4) float64  T_world_box of every frame; NaN where an actor is absent
+                    boxes.npy                (A, 3)       float64  length, width, height, metres
+                    references/rgb.npy       (R, H, W, 3) uint8    recorded frames
+                    references/depth.npy     (R, H, W)    float16  as the renderer sees it from their believed poses
+                    references/T_world_camera.npy, t_us.npy, actors.npy
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,8 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
-from alpasim_plugin.fixers.references import Picture, ReferenceIndex, WarpTarget
+from alpasim_plugin.fixers.references import ReferenceIndex
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, warp
 from alpasim_plugin.io.reading.arrays import open_npy
 from alpasim_plugin.lab.training.pair_store import READING, PairSequence
 
@@ -56,6 +57,15 @@ class SequenceReferences:
         poses = zip(self.rgb_t_us, self.rgb_T_world_camera, strict=True)
         return ReferenceIndex([RecordedFrame(int(t), "", self.K, T, {}, _unread) for t, T in poses])
 
+    def warped(self, frames: int, count: int, past: bool = False) -> Iterator[tuple[U8, ...]]:
+        """Yield the references of the first frames, at most ``count`` each, as the closed loop gives them."""
+        index, sizes, whole = self.index(), self.sizes(), slice(None)
+        last: Sequence[int] = ()
+        for i in range(frames):
+            last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
+            target = self.target(i, self.K, whole, whole)
+            yield tuple(warp(self.picture(j), target, sizes) for j in last)
+
     def target(self, i: int, K: F64, rows: slice, columns: slice) -> WarpTarget:
         """Return a crop of frame ``i`` as a view; ``K`` is that of the crop."""
         return WarpTarget(K, self.T_world_camera[i], self.depth[i, rows, columns].astype(np.float32), _named(self.actors[i]))
@@ -70,9 +80,7 @@ class SequenceReferences:
         return {str(a): Box(*map(float, size)) for a, size in enumerate(self.boxes)}
 
 
-def write_references(
-    folder: Path, frames: Sequence[FrameGeometry], recorded: Sequence[RecordedFrame], actors: Sequence[Actor]
-) -> None:
+def write_references(folder: Path, frames: Sequence[FrameGeometry], recorded: Sequence[RecordedFrame], actors: Sequence[Actor]) -> None:
     """Write the recorded frames of a sequence into its folder.
 
     Args:

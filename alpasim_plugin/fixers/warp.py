@@ -1,21 +1,83 @@
-"""The compiled part of `alpasim_plugin.fixers.references`, and the plain arithmetic that it is held to."""
+"""Carry a recorded frame into another view by that view's depth: a compiled kernel, and the plain arithmetic that it is held to."""
 
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 from numba import njit
 
-from alpasim_plugin.core.types import F32, F64, U8, Bool
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
 SLACK, SLACK_M = 0.12, 0.4  # two depths agree within this share and this length: reconstructions are no better
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
-HELD, DOUBTED = 255, 128
+HELD, DOUBTED = 255, 128  # last channel of a reference: the recorded frame shows this surface; it shows the place, at another depth
+
+
+@dataclass(frozen=True, eq=False)
+class WarpTarget:
+    """The view that references are warped into.
+
+    Attributes:
+        K: ``(3, 3)`` pixels.
+        T_world_camera: ``(4, 4)``.
+        depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as infinitely far.
+        actors: ``T_world_box`` of the actors present.
+    """
+
+    K: F64
+    T_world_camera: F64
+    depth: F32
+    actors: Mapping[str, F64]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A recorded frame in memory: see `RecordedFrame`."""
+
+    K: F64
+    T_world_camera: F64
+    rgb: U8
+    depth: F32
+    actors: Mapping[str, F64]
+
+
+def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
+    """Carry a recorded frame into a view by the view's depth.
+
+    A pixel's surface point is moved with the box it lies in, from where the actor is now to where it was when the frame was recorded, and
+    looked up there, between pixels bicubically.
+
+    Args:
+        picture: The recorded frame.
+        target: The view.
+        boxes: Sizes of the actors.
+
+    Returns:
+        ``(H, W, 4)`` uint8: colour, and `HELD` where the recorded frame's own depth agrees with the point, `DOUBTED` where it does not
+        (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to an
+        actor that was not there.
+    """
+    now = [name for name in sorted(target.actors) if name in boxes]
+    T_box_world = np.array([inverse(target.actors[name]) for name in now]).reshape(-1, 4, 4)
+    then = [picture.actors.get(name) for name in now]
+    T_then_box = np.array([np.full((4, 4), np.nan) if T is None else T for T in then]).reshape(-1, 4, 4)
+    sizes = np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
+    view, then = (target.depth, target.K, target.T_world_camera), (picture.K, inverse(picture.T_world_camera), picture.depth)
+    x, y, held = warp_coordinates(*view, *then, T_box_world, T_then_box, sizes)
+    out = np.empty((*held.shape, 4), np.uint8)
+    out[..., :3] = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    out[..., 3] = held
+    return out
 
 
 def warp_coordinates(

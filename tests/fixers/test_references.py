@@ -1,0 +1,188 @@
+"""Recorded frames as references: which are chosen, and that a warp puts every surface where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.geometry import inverse, se2
+from alpasim_plugin.core.types import F32, F64, U8, Actor, Box, CameraSpec, Frame, RecordedFrame, RenderRequest, Trajectory
+from alpasim_plugin.fixers.references import ReferenceIndex, ReferenceSession
+from alpasim_plugin.fixers.warp import DOUBTED, HELD, Picture, WarpTarget, plain_coordinates, warp, warp_coordinates
+
+WIDTH, HEIGHT = 64, 32
+K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
+FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # a camera that looks along x of its rig
+NOBODY: Mapping[str, F64] = {}
+
+
+def at(x: float, y: float = 0.0, yaw: float = 0.0) -> F64:
+    return se2(x, y, yaw) @ FORWARD
+
+
+def wall(x_m: float, T_world_camera: F64) -> F32:
+    """Depth of a wall across the street at ``x_m``, seen along x."""
+    return np.full((HEIGHT, WIDTH), x_m - T_world_camera[0, 3], np.float32)
+
+
+def picture(T_world_camera: F64, depth: F32, rgb: U8 | None = None, actors: Mapping[str, F64] = NOBODY) -> Picture:
+    noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return Picture(K, T_world_camera, noise if rgb is None else rgb, depth, actors)
+
+
+def columns() -> U8:
+    """A picture whose red says the column, four grey levels each."""
+    return np.repeat(np.broadcast_to(4 * np.arange(WIDTH, dtype=np.uint8), (HEIGHT, WIDTH))[..., None], 3, axis=2)
+
+
+def test_a_frame_warped_into_its_own_view_is_itself() -> None:
+    depth = np.random.default_rng(1).uniform(2, 60, (HEIGHT, WIDTH)).astype(np.float32)
+    depth[:8] = 0  # sky
+    one = picture(at(3.0, 1.0, 0.3), depth)
+    out = warp(one, WarpTarget(K, one.T_world_camera, depth, {}), {})
+    assert (out[..., 3] == HELD).all()
+    assert np.abs(out[..., :3].astype(int) - one.rgb).max() <= 1
+
+
+def test_a_wall_seen_from_nearer_is_larger() -> None:
+    far, near = at(0.0), at(10.0)
+    out = warp(picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}), {})
+    # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
+    expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
+    assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
+    assert (out[..., 3] == HELD).all()
+
+
+def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_there() -> None:
+    here = at(0.0)
+    seen, depth = wall(20.0, here), wall(20.0, here)
+    seen[:, 20:40] = 5.0  # a post hid the wall when the frame was recorded
+    out = warp(picture(here, seen), WarpTarget(K, here, depth, {}), {})
+    assert (out[:, 20:40, 3] == DOUBTED).all()
+    assert (out[:, :20, 3] == HELD).all()
+    aside = warp(picture(here, depth), WarpTarget(K, at(0.0, 12.0), depth, {}), {})  # 12 m to the left: 24 px at 20 m
+    assert (aside[:, :24, 3] == 0).all()
+    assert (aside[:, 24:, 3] == HELD).all()
+
+
+def test_nothing_but_the_rotation_moves_the_sky() -> None:
+    sky = np.zeros((HEIGHT, WIDTH), np.float32)
+    one = picture(at(0.0), sky, columns())
+    assert np.abs(warp(one, WarpTarget(K, at(40.0, 9.0), sky, {}), {})[..., 0].astype(int) - one.rgb[..., 0]).max() <= 1
+    turned = warp(one, WarpTarget(K, at(0.0, 0.0, 0.1), sky, {}), {})
+    middle = 32 - 40 * np.tan(0.1)  # a turn to the left looks at what lay left of the middle
+    assert turned[HEIGHT // 2, 32, 0] == pytest.approx(4 * middle, abs=3)
+
+
+def test_a_car_is_looked_up_where_it_was() -> None:
+    box, now, then = Box(4.0, 2.0, 1.5), se2(20.0, 0.0, 0.0, 0.75), se2(14.0, 3.0, 0.0, 0.75)
+    here = at(0.0)
+    depth = np.zeros((HEIGHT, WIDTH), np.float32)
+    rows, car = slice(16, 19), slice(30, 34)
+    depth[rows, car] = 18.0  # its rear
+    before = np.zeros((HEIGHT, WIDTH), np.float32)
+    before[:, :] = 12.0
+    out = warp(picture(here, before, columns(), {"car": then}), WarpTarget(K, here, depth, {"car": now}), {"car": box})
+    middle = 32 - 40 * 3.0 / 12.0  # 3 m to the left at 12 m
+    assert out[17, 31:33, 0].mean() == pytest.approx(4 * (middle - 0.5), abs=4)
+    assert (out[rows, car, 3] == HELD).all()
+    gone = warp(picture(here, before, columns()), WarpTarget(K, here, depth, {"car": now}), {"car": box})
+    assert (gone[rows, car, 3] == 0).all()
+
+
+def hard_case(seed: int) -> tuple[F32, F64, F64, F64, F64, F32, F64, F64, F64]:
+    """Depths of zero, of centimetres and of kilometres, cameras that look away, boxes around the camera, actors that were absent."""
+    rng = np.random.default_rng(seed)
+    depth, then = (np.exp(rng.uniform(-4, 9, (HEIGHT, WIDTH))).astype(np.float32) for _ in range(2))
+    depth[rng.random(depth.shape) < 0.2], then[rng.random(then.shape) < 0.2] = 0, 0
+    view, other = at(0.0), at(*rng.uniform(-30, 30, 2), rng.uniform(-3, 3))
+    count = int(rng.integers(0, 5))
+    T_now = np.array([se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]).reshape(-1, 4, 4)
+    T_then = np.array([se2(*rng.uniform(-20, 20, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]).reshape(-1, 4, 4)
+    T_then[rng.random(count) < 0.3] = np.nan
+    sizes = rng.uniform(0.3, 6.0, (count, 3))
+    return depth, K, view, K, inverse(other), then, inverse(T_now) if count else T_now, T_then, sizes
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
+    case = hard_case(seed)
+    fast, plain = warp_coordinates(*case), plain_coordinates(*case)
+    # A point exactly on a border may fall to either side: at most one pixel in a thousand.
+    differs = fast[2] != plain[2]
+    assert differs.mean() <= 1e-3
+    for a, b in zip(fast[:2], plain[:2], strict=True):
+        assert np.abs(a - b)[~differs].max(initial=0) < 1e-2
+
+
+def recorded(
+    places: Sequence[tuple[float, float]], step_us: int = 500_000, read: Callable[[], tuple[U8, F32]] | None = None
+) -> list[RecordedFrame]:
+    def none() -> tuple[U8, F32]:
+        return np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((HEIGHT, WIDTH), np.float32)
+
+    return [RecordedFrame(i * step_us, "front", K, at(x, 0.0, yaw), {}, read or none) for i, (x, yaw) in enumerate(places)]
+
+
+def test_the_nearest_frames_come_first_and_far_old_or_turned_ones_not_at_all() -> None:
+    index = ReferenceIndex(recorded([(0, 0), (5, 0), (10, 0), (11, 2.0), (200, 0)]))
+    assert index.choose(at(6.0), 600_000, 2) == (1, 2)
+    assert index.choose(at(6.0), 600_000, 9) == (1, 2, 0)
+    assert index.choose(at(6.0), 20_000_000, 9) == ()
+    assert index.choose(at(6.0), 600_000, 0) == ()
+    assert ReferenceIndex([]).choose(at(0.0), 0, 2) == ()
+
+
+def test_a_reference_stays_until_another_is_clearly_nearer() -> None:
+    index = ReferenceIndex(recorded([(0, 0), (5, 0)], step_us=1))
+    assert index.choose(at(2.6), 0, 1) == (1,)
+    assert index.choose(at(2.6), 0, 1, last=(0,)) == (0,)
+    assert index.choose(at(3.5), 0, 1, last=(0,)) == (1,)
+
+
+def test_only_earlier_frames_are_references_where_the_past_is_asked_for() -> None:
+    index = ReferenceIndex(recorded([(0, 0), (5, 0), (10, 0)]))
+    assert index.choose(at(6.0), 500_000, 3, past=True) == (0,)
+    assert index.choose(at(6.0), 0, 3, past=True) == ()
+
+
+def session(which: str = "all", holds_on: bool = True) -> tuple[ReferenceSession, list[int]]:
+    reads: list[int] = []
+
+    def read() -> tuple[U8, F32]:
+        reads.append(1)
+        return np.full((HEIGHT, WIDTH, 3), 7, np.uint8), np.full((HEIGHT, WIDTH), 20.0, np.float32)
+
+    car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
+    frames = recorded([(float(x), 0.0) for x in range(0, 60, 2)], step_us=100_000, read=read)
+    return ReferenceSession(frames, [car], 2, which, holds_on), reads  # type: ignore[arg-type]
+
+
+def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
+    spec = CameraSpec("front", WIDTH, HEIGHT, K, FORWARD)
+    frame = Frame(t_us, "front", np.zeros((HEIGHT, WIDTH, 3), np.uint8), None, np.full((HEIGHT, WIDTH), 20.0, np.float32))
+    return RenderRequest(t_us, spec, np.stack([at(x), at(x)]), {}), frame
+
+
+def test_a_recorded_frame_is_read_when_it_is_first_needed_and_then_kept() -> None:
+    found, reads = session()
+    for step in range(5):
+        references = found.of(*request(10.0 + 0.02 * step, 500_000 + step))
+        assert [image.shape for image in references] == [(HEIGHT, WIDTH, 4)] * 2
+    assert len(reads) == 2
+
+
+def test_a_frame_without_depth_has_no_references() -> None:
+    found, _ = session()
+    asked, frame = request(10.0, 0)
+    assert found.of(asked, Frame(0, "front", frame.rgb)) == ()
+
+
+def test_without_memory_the_same_view_has_the_same_references_whatever_came_before() -> None:
+    found, _ = session(holds_on=False)
+    alone = found.of(*request(10.9, 500_000))
+    found.of(*request(40.0, 2_000_000))
+    again = found.of(*request(10.9, 500_000))
+    assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
