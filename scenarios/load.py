@@ -30,6 +30,7 @@ from alpasim_plugin.io.reading import check_regular
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.plugins.parts.spec import digest
 from alpasim_plugin.world.ego import speeds
+from alpasim_plugin.world.paint import with_default_paint
 from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_scenario
 from scenarios.build import built_drive
@@ -41,6 +42,7 @@ from scenarios.sources import open_document, recorded_drive, source_digest
 from scenarios.variation import Drawn, draw
 
 DOING = "reading a scenario"
+RECORDED_STREETS = ("usdz", "drive")  # sources whose street is recorded, whatever renders it
 ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
 # Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).
 _RIG_FROM_FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -91,11 +93,15 @@ def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
     scene_id = spec.scene_id or (drawn.scene_id if is_file else drive.scene_id)  # a bare log keeps its id whatever is overridden
     cameras = tuple(camera_spec(camera) for camera in spec.cameras or ()) or drive.cameras or (camera_spec(),)
     start, end = _window(drawn, drive)
+    background = _background(drawn)
+    # Where the street itself is built its paint is chosen; paint that nobody knows of a recorded street stays unknown.
+    recorded = drive.source in RECORDED_STREETS or (background is not None and not background.keep_road)
+    lane_map = drive.lane_map if recorded else with_default_paint(drive.lane_map)
     return Scenario(
         scene_id=f"{scene_id}-seed{spec.seed}" if drawn.reseeded else scene_id,
         source=drive.source,
         seed=spec.seed,
-        lane_map=drive.lane_map,
+        lane_map=lane_map,
         ground=drive.ground,
         ego_log=drive.ego_log,
         vehicle=_vehicle(spec.vehicle) if spec.vehicle else drive.vehicle,
@@ -109,7 +115,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
         latency=Latency(**spec.latency.model_dump()),
         environment=Environment(**spec.environment.model_dump()),
         degradation=Degradation(**spec.degradation.model_dump()),
-        background=_background(drawn),
+        background=background,
         world_origin=drive.world_origin,
         content_hash=_hash(drawn, scene_id, drive.content_hash),
         notes=drive.notes,

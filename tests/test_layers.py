@@ -18,10 +18,10 @@ A = "alpasim_plugin."
 BASE = (A + "core", A + "io", A + "process", A + "plugins")
 STAGES: dict[str, tuple[str, ...]] = {
     A + "world": (),
-    A + "gaussians": (),
+    A + "gaussians": (A + "world",),
     "scenarios": (A + "world",),
     A + "nets": (),
-    A + "semantic_map": (A + "gaussians",),
+    A + "semantic_map": (A + "gaussians", A + "world"),
     A + "renderers": (A + "gaussians", A + "world"),
     A + "fixers": (A + "gaussians", A + "world", A + "nets", A + "semantic_map"),
     "policies": (),

@@ -1,8 +1,6 @@
 """The layers of the semantic map, and their conversion to arrays: straight segments with width and colour, and flat triangles.
 
-A line is drawn once. Marking lines of the map replace lane edges; without them the painted edges of lanes are drawn, an edge shared by
-neighbours once. Edges of unknown paint are drawn as untyped lane boundaries, except inside intersections, where such edges are virtual;
-edges known to be unpainted are not drawn.
+What is painted is the rule of `world.paint`: marking lines and lane edges of known paint, each once; unknown paint is drawn as nothing.
 """
 
 from __future__ import annotations
@@ -11,18 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, Actor, Bool, Box, LaneMap, Paint
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.semantic_map.style import OPENGL, AreaKind, LightState, LineColour, MapStyle, Pattern, Rgb
+from alpasim_plugin.world.paint import painted_lines
 
 POLE_HEIGHT_M = 3.0  # of poles given as one point
-SAME_EDGE_M = 0.45  # edges of two lanes nearer than this are one edge
-SAMPLE_M = 2.0
 
 _PAINT: Mapping[Paint, tuple[LineColour, tuple[Pattern, ...]]] = {
     "solid_white": ("white", ("solid",)),
@@ -30,7 +25,6 @@ _PAINT: Mapping[Paint, tuple[LineColour, tuple[Pattern, ...]]] = {
     "solid_yellow": ("yellow", ("solid",)),
     "dashed_yellow": ("yellow", ("long_dashed",)),
     "double_yellow": ("yellow", ("solid", "solid")),
-    "unknown": ("untyped", ("solid",)),
 }
 
 
@@ -93,52 +87,7 @@ def actor_boxes(poses: Mapping[str, F64], actors: Sequence[Actor]) -> tuple[Acto
 
 def lane_lines(lane_map: LaneMap) -> tuple[LaneLine, ...]:
     """Return the lane lines of a map, each drawn once."""
-    painted: list[tuple[F64, Paint]]
-    if lane_map.markings:
-        painted = [(m.xyz, m.paint) for m in lane_map.markings if len(m.xyz) > 1 and m.paint != "none"]
-    else:
-        painted = _edges_once(lane_map)
-    return tuple(LaneLine(xyz, *_PAINT[paint]) for xyz, paint in painted)
-
-
-def _edges_once(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
-    """Return lane edges with paint; of edges that run together the one whose paint is known, else the first."""
-    edges: list[tuple[F64, Paint, bool]] = []
-    for lane in (lane_map.lanes[k] for k in sorted(lane_map.lanes)):
-        for line, paint in ((lane.left, lane.left_paint), (lane.right, lane.right_paint)):
-            if line is not None and len(line) > 1 and arc_lengths(line)[-1] > 0.1:
-                edges.append((line, paint, lane.is_intersection))
-    if not edges:
-        return []
-    points, headings, owner = _samples([line for line, _, _ in edges])
-    near = scipy.spatial.KDTree(points).query_ball_point(points, SAME_EDGE_M)
-    samples_of = np.split(np.arange(len(owner)), np.flatnonzero(np.diff(owner)) + 1)
-    taken = np.zeros(len(edges), dtype=bool)
-    chosen: list[tuple[F64, Paint]] = []
-    for i in sorted(range(len(edges)), key=lambda i: (edges[i][1] == "unknown", i)):
-        line, paint, in_junction = edges[i]
-        covered = sum(any(taken[owner[j]] and abs(headings[j] @ headings[k]) > 0.8 for j in near[k]) for k in samples_of[i])
-        virtual = paint == "unknown" and in_junction
-        if covered > 0.6 * len(samples_of[i]) or virtual:
-            continue
-        taken[i] = True
-        if paint != "none":
-            chosen.append((line, paint))
-    return chosen
-
-
-def _samples(lines: Sequence[F64]) -> tuple[F64, F64, F64]:
-    """Return points ``(M, 2)``, unit directions ``(M, 2)`` and owners ``(M,)`` of samples along lines."""
-    points, headings, owner = [], [], []
-    for i, line in enumerate(lines):
-        length = float(arc_lengths(line)[-1])
-        s = np.linspace(0.0, length, max(2, int(np.ceil(length / SAMPLE_M)) + 1))
-        at = resample(line[:, :2], s)
-        direction = np.gradient(at, axis=0)
-        points.append(at)
-        headings.append(direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None])
-        owner.append(np.full(len(s), i))
-    return np.concatenate(points), np.concatenate(headings), np.concatenate(owner)
+    return tuple(LaneLine(xyz, *_PAINT[paint]) for xyz, paint in painted_lines(lane_map))
 
 
 GROUP = 32  # segments that share a bounding sphere

@@ -8,6 +8,7 @@ import pytest
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Scenario
 from alpasim_plugin.gaussians.scene.paint import GAP_M, LINE_M, WHITE, YELLOW, Strokes, paint_strokes
 from alpasim_plugin.gaussians.scene.site import make_site
+from alpasim_plugin.world.paint import with_default_paint
 from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
 
 PATH = line((0, -1.8), (60, -1.8))
@@ -30,7 +31,12 @@ def length(strokes: Strokes, chosen: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def two_by_two() -> tuple[Strokes, F64]:
-    return strokes_of(make_scenario(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r")), PATH))
+    return strokes_of(make_scenario(with_default_paint(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r"))), PATH))
+
+
+def test_unknown_paint_is_nothing() -> None:
+    strokes, _ = strokes_of(make_scenario(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r")), PATH))
+    assert len(strokes.start) == 0
 
 
 def test_unknown_edge_between_lanes_of_one_direction_is_dashed_white(two_by_two: tuple[Strokes, F64]) -> None:
@@ -59,10 +65,10 @@ def test_unknown_edge_between_opposing_lanes_is_double_yellow(two_by_two: tuple[
     assert not at(middle, 0.0).any()
 
 
-def test_unknown_outer_edge_is_solid_white_just_inside_the_lane(two_by_two: tuple[Strokes, F64]) -> None:
+def test_unknown_outer_edge_is_solid_white(two_by_two: tuple[Strokes, F64]) -> None:
     strokes, middle = two_by_two
     for side in (-1, 1):
-        chosen = at(middle, side * (2 * LANE_M - 0.2))
+        chosen = at(middle, side * 2 * LANE_M)
         assert set(strokes.colour[chosen]) == {WHITE}
         assert length(strokes, chosen) > 210
 
@@ -71,7 +77,7 @@ def test_dashes_run_on_from_lane_to_lane() -> None:
     lanes: dict[str, Lane] = {}
     for i in range(4):
         lanes |= road_lanes(line((i * 17.0, 0), (i * 17.0 + 17.0, 0)), f"r{i}", 2)
-    strokes, middle = strokes_of(make_scenario(LaneMap(lanes), PATH))
+    strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
     chosen = at(middle, -LANE_M)
     x = np.sort(np.concatenate([strokes.start[chosen, 0], strokes.end[chosen, 0]]))
     assert np.diff(x).max() == pytest.approx(GAP_M, abs=0.1)
@@ -80,7 +86,7 @@ def test_dashes_run_on_from_lane_to_lane() -> None:
 def test_known_paint_is_believed_and_shared_edges_are_painted_once() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     lanes["r-a0"] = replace(lanes["r-a0"], right_paint="solid_yellow")  # the same place is r-a1's unknown left edge
-    strokes, middle = strokes_of(make_scenario(LaneMap(lanes), PATH))
+    strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
     chosen = at(middle, -LANE_M)
     assert set(strokes.colour[chosen]) == {YELLOW}
     assert length(strokes, chosen) == pytest.approx(80, rel=0.02)
@@ -89,21 +95,21 @@ def test_known_paint_is_believed_and_shared_edges_are_painted_once() -> None:
 def test_edge_known_to_be_bare_stays_bare() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     lanes["r-a1"] = replace(lanes["r-a1"], left_paint="none")
-    _, middle = strokes_of(make_scenario(LaneMap(lanes), PATH))
+    _, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
     assert not at(middle, -LANE_M).any()
     assert at(middle, LANE_M).any()
 
 
 def test_nothing_unknown_is_painted_inside_an_intersection() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 1, is_intersection=True)
-    strokes, _ = strokes_of(make_scenario(LaneMap(lanes), PATH))
+    strokes, _ = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
     assert len(strokes.start) == 0
 
 
 def test_map_with_marking_lines_keeps_unknown_lane_edges_bare() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     marking = Marking(line((0, -LANE_M), (80, -LANE_M)), "solid_white")
-    strokes, middle = strokes_of(make_scenario(LaneMap(lanes, markings=(marking,)), PATH))
+    strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes, markings=(marking,))), PATH))
     assert at(middle, -LANE_M).all()
     assert length(strokes, at(middle, -LANE_M)) == pytest.approx(80, rel=0.02)
 

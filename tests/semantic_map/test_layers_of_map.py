@@ -32,8 +32,11 @@ def test_edge_shared_by_two_lanes_is_drawn_once_with_the_paint_that_is_known():
     assert sorted(found) == [
         (-1.75, "white", ("solid",)),
         (1.75, "white", ("long_dashed",)),
-        (5.25, "untyped", ("solid",)),
     ]
+
+
+def test_unknown_paint_is_drawn_as_nothing():
+    assert drawn(lane("1", 0.0), lane("2", 3.5)) == []
 
 
 def test_edge_shared_with_oncoming_traffic_is_drawn_once():
@@ -54,11 +57,13 @@ def test_unpainted_edges_and_virtual_ones_inside_intersections_are_not_drawn():
     assert len(drawn(lane("1", 0.0, "solid_white", "unknown", is_intersection=True))) == 1
 
 
-def test_marking_lines_replace_lane_edges():
+def test_marking_lines_are_drawn_with_the_lane_edges_of_known_paint_beside_which_none_runs():
     line = np.array([[0.0, 0, 0], [9, 0, 0]])
     markings = (Marking(line, "dashed_yellow"), Marking(line + 1, "none"), Marking(line[:1], "unknown"))
     found = drawn(lane("1", 0.0, "solid_white"), markings=markings)
-    assert found == [(0.0, "yellow", ("long_dashed",))]
+    assert found == [(0.0, "yellow", ("long_dashed",)), (1.75, "white", ("solid",))]
+    along = (Marking(np.array([[-40.0, 1.75, 0], [80, 1.75, 0]]), "dashed_yellow"),)
+    assert drawn(lane("1", 0.0, "solid_white"), markings=along) == [(1.75, "yellow", ("long_dashed",))]
 
 
 def test_untyped_style_draws_every_line_solid():

@@ -1,23 +1,20 @@
 """Road paint as short straight strokes, from lane edges, marking lines, crosswalks and stop lines.
 
-Where a map does not give the paint of a lane's edge, a default rule applies: an edge shared by two lanes of one direction is a dashed
-white line, one between opposing lanes a double yellow one, an outer edge a solid white line; inside intersections nothing is painted.
-In maps with marking lines of their own, lane edges of unknown paint stay unpainted.
+Which lines are painted is the rule of `world.paint`.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-import scipy
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Paint
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site, left_of, unit
+from alpasim_plugin.world.paint import painted_lines
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern
 LINE_WIDTH_M = 0.14
@@ -25,9 +22,6 @@ DOUBLE_OFFSET_M = 0.16
 STEP_M = 0.75  # length of a stroke of a line; a quarter of a dash
 BAR_M = 0.45  # zebra bar and the gap beside it
 STOP_LINE_M = 0.4
-INSET_M = 0.2  # paint on an outer edge lies this far inside the lane
-SAME_EDGE_M = 0.45  # edges of two lanes nearer than this are one edge
-SAMPLE_M = 2.0
 WHITE, YELLOW = 0, 1
 
 
@@ -40,22 +34,12 @@ class Strokes(NamedTuple):
     colour: I64  # (M,) WHITE or YELLOW
 
 
-@dataclass(frozen=True)
-class _Edge:
-    """One edge of one lane, ground coordinates, in driving direction."""
-
-    lane_id: str
-    side: int  # +1 left, -1 right
-    line: F64  # (N, 2)
-    paint: Paint
-    in_junction: bool
-
-
 def paint_strokes(site: Site) -> Strokes:
     """Return all paint near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
-    lines = [edge for edge in _painted_edges(site) if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)]
+    painted = [(site.frame.to_ground(line), paint) for line, paint in painted_lines(lane_map)]
+    lines = [edge for edge in painted if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)]
     pieces = [_line_strokes(line, paint, phase) for line, paint, phase in _with_phase(lines)]
     pieces += [_zebra(site.frame.to_ground(ring)) for ring in lane_map.crosswalks]
     for stop in lane_map.stop_lines:
@@ -69,72 +53,6 @@ def paint_strokes(site: Site) -> Strokes:
     width_m, colour = np.concatenate([p.width_m for p in pieces]), np.concatenate([p.colour for p in pieces])
     inside = np.all((start > site.low) & (start < high), axis=1)
     return Strokes(start[inside], end[inside], width_m[inside], colour[inside])
-
-
-def _painted_edges(site: Site) -> list[tuple[F64, Paint]]:
-    """Choose edges and lines so that no place is painted twice."""
-    lane_map = site.scenario.lane_map
-    edges: list[_Edge] = []
-    for marking in lane_map.markings:
-        if len(marking.xyz) > 1:
-            paint: Paint = "solid_white" if marking.paint == "unknown" else marking.paint
-            edges.append(_Edge("", 0, site.frame.to_ground(marking.xyz), paint, False))
-    for lane in (lane_map.lanes[k] for k in sorted(lane_map.lanes)):
-        for side, line, paint in ((1, lane.left, lane.left_paint), (-1, lane.right, lane.right_paint)):
-            if line is not None and len(line) > 1 and lane.kind != "parking":
-                edges.append(_Edge(lane.lane_id, side, site.frame.to_ground(line), paint, lane.is_intersection))
-    edges = [e for e in edges if arc_lengths(e.line)[-1] > 0.5]
-    if not edges:
-        return []
-    owner, points, headings = _sample(edges)
-    near = scipy.spatial.KDTree(points).query_ball_point(points, SAME_EDGE_M)
-    samples_of = [np.flatnonzero(owner == i) for i in range(len(edges))]
-    accepted = np.zeros(len(edges), dtype=bool)
-    chosen: list[tuple[F64, Paint]] = []
-    believes_markings = bool(lane_map.markings)
-    for i in sorted(range(len(edges)), key=lambda i: (_rank(edges[i].paint), i)):
-        edge, mine = edges[i], samples_of[i]
-        covered = np.mean([any(accepted[owner[j]] and abs(headings[j] @ headings[k]) > 0.8 for j in near[k]) for k in mine])
-        if covered > 0.6:
-            continue
-        accepted[i] = not (edge.paint == "unknown" and edge.in_junction)
-        if edge.paint == "none" or (edge.paint == "unknown" and (edge.in_junction or believes_markings)):
-            continue
-        if edge.paint != "unknown":
-            chosen.append((edge.line, edge.paint))
-        else:
-            beside = [(edges[owner[j]], float(headings[k] @ headings[j])) for k in mine for j in near[k] if owner[j] != i]
-            chosen.append(_guess(edge, beside, len(mine)))
-    return chosen
-
-
-def _rank(paint: Paint) -> int:
-    return {"none": 1, "unknown": 2}.get(paint, 0)
-
-
-def _sample(edges: list[_Edge]) -> tuple[I64, F64, F64]:
-    """Return (edge index, point, unit heading) of samples along all edges, their ends left out."""
-    owner, points, headings = [], [], []
-    for i, edge in enumerate(edges):
-        length = arc_lengths(edge.line)[-1]
-        n = max(3, int(length / SAMPLE_M))
-        s = (np.arange(n) + 0.5) / n * length
-        a, b = resample(edge.line, s - 0.1), resample(edge.line, s + 0.1)
-        owner.append(np.full(n, i))
-        points.append((a + b) / 2)
-        headings.append(unit(b - a))
-    return np.concatenate(owner), np.concatenate(points), np.concatenate(headings)
-
-
-def _guess(edge: _Edge, neighbours: list[tuple[_Edge, float]], n: int) -> tuple[F64, Paint]:
-    """Choose the paint of an edge with n samples from the edges on it: (edge, cosine of the two headings) per matching sample."""
-    shared = sum(other.side == -edge.side and cosine > 0.8 for other, cosine in neighbours)
-    opposing = sum(other.side == edge.side and cosine < -0.8 for other, cosine in neighbours)
-    if max(shared, opposing) < 0.4 * n:
-        d = np.gradient(edge.line, axis=0)
-        inward = -left_of(unit(d)) * edge.side
-        return edge.line + INSET_M * inward, "solid_white"
-    return edge.line, "dashed_white" if shared >= opposing else "double_yellow"
 
 
 def _with_phase(lines: list[tuple[F64, Paint]]) -> list[tuple[F64, Paint, float]]:

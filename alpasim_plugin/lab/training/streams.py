@@ -23,6 +23,7 @@ from alpasim_plugin.core.types import F32, I64, U8
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.lab.training.episode_references import ReferenceDraw, draw_references, pair_references, video_references
 from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
+from alpasim_plugin.lab.training.map_errors import MapError, draw_map_error, with_error
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
 
 DOING = "making training streams"
@@ -106,6 +107,8 @@ class Episode:
         references: Which recorded frames are there, and how wrong they are.
         better: How far a render is moved to the truth, 0 to 1.
         grey: Whether all is without colour.
+        map_error: What is wrong with the map.
+        other: Of which sequence the map is, where it is that of another.
     """
 
     kind: int
@@ -124,6 +127,8 @@ class Episode:
     references: ReferenceDraw
     better: float
     grey: bool
+    map_error: MapError
+    other: PairSequence
 
 
 class TrainingStreams:
@@ -209,9 +214,11 @@ class TrainingStreams:
         lost = draw_lost_resolution(rng, *self.crop) if loses else None
         references, better, grey = draw_references(rng), float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER), rng.random() < P_GREY
         car_class = other if class_colours else None
+        map_error, elsewhere = draw_map_error(rng), self.pairs[int(rng.integers(len(self.pairs)))]
         return Episode(
-            kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better, grey
-        )
+            kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better, grey,
+            map_error, elsewhere,
+        )  # fmt: skip
 
     def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32]:
         """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target and references of an episode's update."""
@@ -240,7 +247,9 @@ class TrainingStreams:
         references = _lit_references(recorded(source, episode.references, index, rows, columns), episode)  # type: ignore[operator]
         if episode.grey:
             render, target, references[..., :3] = _grey(render, 1), _grey(target, 1), _grey(references[..., :3], -1)
-        return render, opacity, self._map(cut(clip.sdmap), episode), target, references
+        other = episode.other.clip.sdmap if episode.map_error.kind == "other" else clip.sdmap
+        sdmap = other if other.shape == clip.sdmap.shape else clip.sdmap
+        return render, opacity, self._map(with_error(cut(sdmap), episode.map_error), episode), target, references
 
     def _map(self, sdmap: U8, episode: Episode) -> F32:
         shown = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap

@@ -7,7 +7,6 @@ cuts at a junction of roads is one instance. A line that turns back is cut where
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from alpasim_plugin.core.geometry import inverse, resample, transform_points
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.learned_metrics.types import FORWARD_M, NEAREST_CORNER_M, Cuboid, Lane3D, hull_pixels
-from alpasim_plugin.semantic_map.prepare import lane_lines
+from alpasim_plugin.world.paint import painted_lines
 
 VEHICLES = ("car", "truck", "bus")
 FARTHEST_M = 60.0  # of a labelled vehicle
@@ -28,10 +27,7 @@ STEP_M = 1.0
 
 def world_lines(lane_map: LaneMap) -> list[F64]:
     """Return the painted lines of a map, each ``(N, 3)`` metres, world; ends that meet are joined."""
-    drawn = lane_lines(lane_map)
-    if lane_map.markings:  # they replace lane edges there, but the road also shows the edges whose paint is known
-        drawn += tuple(line for line in lane_lines(replace(lane_map, markings=())) if line.colour != "untyped")
-    lines = [line.xyz for line in drawn if len(line.xyz) > 1]
+    lines = [xyz for xyz, _ in painted_lines(lane_map)]
     out: list[F64] = []
     while lines:
         line = lines.pop(0)

@@ -1,0 +1,126 @@
+"""Which lines of a map are painted on the road: one rule, which the built world, the semantic map and the learned metrics share.
+
+Paint is what the map says: its marking lines, and the edges of lanes whose paint it knows. Unknown paint is nothing: a line that nobody has
+seen is not drawn. Where the road itself is built, its paint is a choice, and `with_default_paint` makes it before anything is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64, I64, Lane, LaneMap, Paint
+
+SAME_EDGE_M = 0.45  # edges of two lanes nearer than this are one edge
+SAMPLE_M = 2.0
+SHORTEST_M = 0.5
+COVERED = 0.6  # share of an edge's samples beside which another edge runs
+ALONG = 0.8  # cosine between two edges that run together
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """One edge of one lane in driving direction, or a marking line."""
+
+    lane_id: str
+    side: int  # +1 left, -1 right, 0 a marking line
+    line: F64  # (N, 3) metres, world
+    paint: Paint
+    in_junction: bool
+
+
+class _Edges:
+    """All edges of a map, with samples along them; ends are left out, for there other lanes begin."""
+
+    def __init__(self, lane_map: LaneMap) -> None:
+        self.all = [edge for edge in _edges_of(lane_map) if len(edge.line) > 1 and arc_lengths(edge.line)[-1] > SHORTEST_M]
+        owner, points, headings = [np.zeros(0, np.int64)], [np.zeros((0, 2))], [np.zeros((0, 2))]
+        for i, edge in enumerate(self.all):
+            length = float(arc_lengths(edge.line)[-1])
+            n = max(3, int(length / SAMPLE_M))
+            s = (np.arange(n) + 0.5) / n * length
+            a, b = resample(edge.line[:, :2], s - 0.1), resample(edge.line[:, :2], s + 0.1)
+            owner.append(np.full(n, i))
+            points.append((a + b) / 2)
+            headings.append((b - a) / np.maximum(np.linalg.norm(b - a, axis=1), 1e-12)[:, None])
+        self.owner: I64 = np.concatenate(owner)
+        self.headings: F64 = np.concatenate(headings)
+        tree = scipy.spatial.KDTree(np.concatenate(points))
+        self.near = tree.query_ball_point(tree.data, SAME_EDGE_M) if len(self.owner) else []
+
+    def beside(self, i: int) -> list[list[tuple[int, float]]]:
+        """Return for every sample of edge ``i`` the other edges there, each with the cosine between the two headings."""
+        return [
+            [(int(self.owner[j]), float(self.headings[k] @ self.headings[j])) for j in self.near[k] if self.owner[j] != i]
+            for k in np.flatnonzero(self.owner == i)
+        ]
+
+
+def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
+    """Return what is painted along lanes, each place once.
+
+    Returns:
+        Lines ``(N, 3)``, metres, world, with their paint, which is neither ``none`` nor ``unknown``: marking lines first, then lane edges;
+        an edge along which an earlier line runs is left out.
+    """
+    edges = _Edges(lane_map)
+    taken: set[int] = set()
+    for i, edge in enumerate(edges.all):
+        if edge.paint in ("none", "unknown"):
+            continue
+        samples = edges.beside(i)
+        covered = np.mean([any(j in taken and abs(cosine) > ALONG for j, cosine in here) for here in samples])
+        if covered <= COVERED:
+            taken.add(i)
+    return [(edges.all[i].line, edges.all[i].paint) for i in sorted(taken)]
+
+
+def with_default_paint(lane_map: LaneMap) -> LaneMap:
+    """Return a map whose unknown paint is chosen, for a road that is built from it.
+
+    An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes a double yellow one, an outer edge a
+    solid white line; inside intersections nothing is painted. In maps with marking lines of their own, lane edges of unknown paint stay
+    as they are, and unknown marking lines are solid white.
+    """
+    if lane_map.markings:
+        markings = tuple(replace(m, paint="solid_white") if m.paint == "unknown" else m for m in lane_map.markings)
+        return replace(lane_map, markings=markings)
+    edges = _Edges(lane_map)
+    chosen: dict[tuple[str, int], Paint] = {}
+    for i, edge in enumerate(edges.all):
+        if edge.paint == "unknown":
+            chosen[edge.lane_id, edge.side] = "none" if edge.in_junction else _default(edges, i)
+    lanes = {name: _repainted(lane, chosen) for name, lane in lane_map.lanes.items()}
+    return replace(lane_map, lanes=lanes)
+
+
+def _default(edges: _Edges, i: int) -> Paint:
+    """Return the paint of an unknown edge: that of a known one along it, else what its neighbours suggest."""
+    samples = edges.beside(i)
+    for paint in ("none", *dict.fromkeys(edge.paint for edge in edges.all if edge.paint not in ("none", "unknown"))):
+        known = [any(edges.all[j].paint == paint and abs(cosine) > ALONG for j, cosine in here) for here in samples]
+        if np.mean(known) > COVERED:
+            return paint
+    beside = [(edges.all[j], cosine) for here in samples for j, cosine in here]
+    shared = sum(other.side == -edges.all[i].side and cosine > ALONG for other, cosine in beside)
+    opposing = sum(other.side == edges.all[i].side and cosine < -ALONG for other, cosine in beside)
+    if max(shared, opposing) < 0.4 * len(samples):
+        return "solid_white"
+    return "dashed_white" if shared >= opposing else "double_yellow"
+
+
+def _edges_of(lane_map: LaneMap) -> list[_Edge]:
+    out = [_Edge("", 0, marking.xyz, marking.paint, False) for marking in lane_map.markings]
+    for lane in (lane_map.lanes[k] for k in sorted(lane_map.lanes)):
+        for side, line, paint in ((1, lane.left, lane.left_paint), (-1, lane.right, lane.right_paint)):
+            if line is not None and lane.kind != "parking":
+                out.append(_Edge(lane.lane_id, side, line, paint, lane.is_intersection))
+    return out
+
+
+def _repainted(lane: Lane, chosen: dict[tuple[str, int], Paint]) -> Lane:
+    left = chosen.get((lane.lane_id, 1), lane.left_paint)
+    return replace(lane, left_paint=left, right_paint=chosen.get((lane.lane_id, -1), lane.right_paint))
