@@ -23,6 +23,7 @@ BEND, RISE = 0.03, 0.02  # usual second and first difference of the heights at k
 TURN, CROSS = 0.02, 0.02  # usual difference of neighbouring cross slopes, and second difference of the cross section
 NOISE = 0.015  # of a surface
 LOOSE, TIGHT, ROUNDS = 0.3, 0.06, 10  # where Tukey's weight ends, in the first round and in the last ones
+WHEELS, ASIDE_WEIGHT = 0.8, 0.02  # half the width of what is driven over, and what points beside it count: kerbs come and go
 FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are judged
 CROSS_AT = np.arange(-4, 5) * CROSS_KNOTS  # offsets of the cross section's knots
 CELL_M, BESIDE_M, TILTED_M = 1.0, 60.0, 6.0  # of the height field; beyond TILTED_M beside the path it goes on level
@@ -113,7 +114,7 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     if near.sum() < FEWEST:
         return None
     fitted = _Strip(frame.s / height)
-    weight = 1.0 / (spread[near] ** 2 + NOISE**2)
+    weight = np.where(np.abs(left[near]) < WHEELS, 1.0, ASIDE_WEIGHT) / (spread[near] ** 2 + NOISE**2)
     coefficients, kept = fitted.solve(s[near], left[near], h[near], weight)
     errors = _section_errors(s[near], left[near], h[near] - fitted.value(s[near], left[near], coefficients), spread[near])
     below, tilt, cross = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
@@ -198,7 +199,7 @@ def _hats(s: F64, knots: F64) -> scipy.sparse.csr_matrix:
 
 def _section_errors(s: F64, left: F64, error: F64, spread: F64) -> F64:
     """Return the median error of every section of the strip under the wheels that has eight good points."""
-    under = (np.abs(left) < 0.8) & (spread < 0.06) & (np.abs(error) < LOOSE)
+    under = (np.abs(left) < WHEELS) & (spread < 0.03) & (np.abs(error) < LOOSE)
     section = np.floor(s / SECTION).astype(np.int64)
     groups = [error[under & (section == one)] for one in np.unique(section[under])]
     return np.array([np.median(group) for group in groups if len(group) >= 8])
