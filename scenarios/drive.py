@@ -34,7 +34,7 @@ from alpasim_plugin.io.reading import check_regular
 from alpasim_plugin.io.reading.arrays import open_npy
 from alpasim_plugin.io.reading.files import as_shape
 from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog, actors_of_track, checked_trajectory
+from scenarios.recorded import RecordedLog, checked_trajectory, stands_still
 
 DRIVE_FILE, TRANSFORMS_FILE, GROUND_FILE, MODEL_FOLDER = "drive.json", "transforms.json", "ground.npy", "model"
 DOING = "reading an imported drive"
@@ -218,7 +218,7 @@ def read_drive(folder: Path) -> RecordedLog:
     model = folder / MODEL_FOLDER
     _note_files(files, model)
     obstacles = [_obstacle_actor(one, log) for one in document["obstacles"] or ()]
-    tracks = [actor for track in document["tracks"] for actor in _track_actors(files, path, track)]
+    tracks = [_track_actor(files, path, track) for track in document["tracks"]]
     body = document.get("vehicle")
     return RecordedLog(
         scene_id=document["scene_id"],
@@ -298,10 +298,10 @@ def _ground_of(files: SourceFiles, folder: Path, grid: _Grid) -> HeightField:
     return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], np.array(z, dtype=np.float64))
 
 
-def _track_actors(files: SourceFiles, path: Path, track: _Track) -> list[Actor]:
+def _track_actor(files: SourceFiles, path: Path, track: _Track) -> Actor:
     poses, where = track["poses"], f"{path}, track {track['id']}"
-    trajectory = checked_trajectory(files, where, np.array(poses["t_us"], np.int64), _rows(poses["xyz"]), _rows(poses["quat"], 4))
-    return actors_of_track(track["id"], track["label"], Box(*track["size_m"]), trajectory)
+    one = checked_trajectory(files, where, np.array(poses["t_us"], np.int64), _rows(poses["xyz"]), _rows(poses["quat"], 4))
+    return Actor(track["id"], track["label"], Box(*track["size_m"]), one, stands_still(one.t_us, one.xyz, track["label"]))
 
 
 def _obstacle_document(one: Obstacle) -> _Obstacle:

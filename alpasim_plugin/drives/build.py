@@ -158,7 +158,7 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
 
 def _shown(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
     """Return all photographs with their names, uses and places."""
-    first_us = min(int(one.t_us or 0) for one in drive.pictures)
+    first_us = int(placed.ego.t_us[0])
     out = []
     for camera in drive.cameras:
         name = camera if camera != drive.front or "front" in camera else "front"

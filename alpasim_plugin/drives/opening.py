@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
-from alpasim_plugin.drives.points import Matched, near_epipolar
+from alpasim_plugin.drives.points import Matched, agreeing
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
 from alpasim_plugin.gaussians.sh import C0
@@ -33,6 +33,8 @@ def read_source(folder: Path) -> SourceDrive:
         return _transforms(folder)
     if folder.is_dir() and is_kitti(folder):
         return read_kitti(folder)
+    if folder.is_dir() and is_dgp(folder):
+        return read_dgp(folder)
     inside = ", ".join(sorted(path.name for path in folder.iterdir())[:5]) if folder.is_dir() else "a file"
     raise InputError(DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
 
@@ -73,7 +75,7 @@ def _transforms(folder: Path) -> SourceDrive:
 def recognised_axes(folder: Path) -> tuple[str, str]:
     """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs fit together, and a note.
 
-    With the wrong one every epipolar line is mirrored, so that matching photographs miss it.
+    With the wrong one epipolar lines are mirrored, or points lie behind the cameras.
 
     Raises:
         InputError: Both fit, or neither.
@@ -93,11 +95,4 @@ def recognised_axes(folder: Path) -> tuple[str, str]:
 
 
 def _fits(one: Picture, other: Picture) -> int:
-    """Return how many matches of two photographs lie near their epipolar lines."""
-    a, b = Matched(one, one.rgb()), Matched(other, other.rgb())
-    if min(len(a.at), len(b.at)) < 2:
-        return 0
-    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
-    pairs = matcher.match(a.described, b.described)
-    near = near_epipolar(a, b)
-    return sum(bool(near[match.queryIdx, match.trainIdx]) for match in pairs if match.distance < 0.5)
+    return agreeing(Matched(one, one.rgb()), Matched(other, other.rgb()))

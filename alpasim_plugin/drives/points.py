@@ -96,7 +96,7 @@ def matched(one: Matched, other: Matched) -> tuple[I64, I64]:
     if not len(one.at) or not len(other.at):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     alike = one.described @ other.described.T
-    alike[~near_epipolar(one, other)] = -1.0
+    alike[~_near_epipolar(one, other)] = -1.0
     rows, columns = alike.argmax(axis=1), alike.argmax(axis=0)
     best = alike[np.arange(len(rows)), rows]
     mutual = (columns[rows] == np.arange(len(rows))) & (best > 0.5)
@@ -108,7 +108,20 @@ def matched(one: Matched, other: Matched) -> tuple[I64, I64]:
     return first[good], rows[first][good]
 
 
-def near_epipolar(one: Matched, other: Matched) -> Bool:
+def agreeing(one: Matched, other: Matched) -> int:
+    """Return how many matches two photographs share that lie before both and where both see them."""
+    first, second = matched(one, other)
+    if not len(first):
+        return 0
+    T, tracks = np.array([one.T_camera_world, other.T_camera_world]), np.arange(len(first))
+    track, view = np.concatenate([tracks, tracks]), np.repeat([0, 1], len(first))
+    rays = np.concatenate([one.at[first], other.at[second]])
+    xyz, _ = _least_squares(T, track, view, rays, np.ones(len(track), dtype=bool))
+    error = _errors(T, xyz, track, view, rays) * one.focal
+    return int(((error[: len(first)] < ERROR_PX) & (error[len(first) :] < ERROR_PX)).sum())
+
+
+def _near_epipolar(one: Matched, other: Matched) -> Bool:
     """Return ``(N, M)``: whether a keypoint of ``other`` lies near the epipolar line of one of ``one``."""
     T = other.T_camera_world @ inverse(one.T_camera_world)
     t = T[:3, 3]
