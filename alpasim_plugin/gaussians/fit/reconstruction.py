@@ -114,7 +114,7 @@ def _add(view: PosedView, total: F64, weight: F64) -> None:
     x, y, z = (local @ camera.T_camera_world[:3, :3]).T
     column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
     row = np.rint((HIGH_RAD - np.arctan2(z, np.hypot(x, y))) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))).astype(np.int64).clip(0, HEIGHT - 1)
-    np.add.at(total, (row, column), view.rgb[rows, columns] / 255.0)
+    np.add.at(total, (row, column), view.rgb[rows, columns] / (255.0 * np.array(view.gain)))
     np.add.at(weight, (row, column), 1.0)
 
 
