@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy
 
-from alpasim_plugin.core.types import F64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, huber, place, pose_arrays, projection_slope
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, follow, huber, place, pose_arrays, projection_slope
+from alpasim_plugin.gaussians.fit.views import PosedView
 
 ROUNDS = 12
 SIGMA_M, SIGMA_RAD = 0.05, 0.003  # of a given pose: what correction is likely
@@ -39,6 +41,11 @@ class Adjusted:
     placed: Placed
     before_px: float
     after_px: float
+
+
+def corrected(views: Sequence[PosedView]) -> Adjusted:
+    """Return cameras of views, in the order of the way and of one size, whose poses agree with what the views show."""
+    return adjust([view.camera for view in views], follow(views))
 
 
 def adjust(cameras: Sequence[PinholeCamera], tracks: Tracks) -> Adjusted:
@@ -116,16 +123,13 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     return step, -np.einsum("nij,nj->ni", inverse, gb + back)
 
 
-def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: F64, p: F64) -> tuple[F64, F64]:  # type: ignore[type-arg]
+def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> tuple[F64, F64]:
     """Return the normal equations of the poses alone, ``(6V, 6V)`` and ``(6V,)``."""
-    from scipy.sparse import bsr_matrix
-
     views, n = len(U), len(inverse)
-    blocks = bsr_matrix((np.zeros((0, 6, 3)), np.zeros(0, np.int32), np.zeros(views + 1, np.int32)), shape=(6 * views, 3 * n))
     order = np.argsort(v, kind="stable")
     starts = np.searchsorted(v[order], np.arange(views + 1))
-    blocks = bsr_matrix((W[order], p[order], starts), shape=(6 * views, 3 * n))
-    middle = bsr_matrix((inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
+    blocks = scipy.sparse.bsr_matrix((W[order], p[order], starts), shape=(6 * views, 3 * n))
+    middle = scipy.sparse.bsr_matrix((inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
     H = -(blocks @ middle @ blocks.T).toarray()
     for i in range(views):
         H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += U[i]

@@ -37,6 +37,16 @@ def balances(views: Sequence[PosedView], tracks: Tracks) -> F64:
     return out
 
 
+def gain_between(centres: F64, gains: F64, place: F64) -> F32:
+    """Return the gain ``(3,)`` at a place, of the two nearest of ``centres (N, 3)``, by inverse distance; 1 where there is none."""
+    if not len(centres):
+        return np.ones(3, np.float32)
+    distance = np.linalg.norm(centres - place, axis=1)
+    near = np.argsort(distance, kind="stable")[:2]
+    weight = 1 / (distance[near] + 1e-3)
+    return np.asarray(weight @ gains[near] / weight.sum(), np.float32)
+
+
 def _patch(rgb: F32, at: F64) -> F64:
     patch = cv2.getRectSubPix(rgb, (PATCH_PX, PATCH_PX), (float(at[0] - 0.5), float(at[1] - 0.5)))
     return np.asarray(patch.reshape(-1, 3).mean(axis=0), dtype=np.float64)

@@ -56,6 +56,7 @@ def fit(
     report: Report | None = None,
     device: str = "cpu",
     threads: int | None = None,
+    checked: Sequence[PosedView] = (),
 ) -> Reconstruction:
     """Fit a background, and the actors that ``start`` holds, to posed views.
 
@@ -65,12 +66,14 @@ def fit(
         recipe: Amounts, rates and schedule.
         scene_id: Key of the random streams, with ``recipe.seed``: order of views and splits.
         folder: Receives checkpoints; the same call with the same folder continues, and ends with the same bits. None keeps none.
-        report: Called after every update with loss, psnr_db (of the training view just seen) and gaussians.
+        report: Called after every update with loss, psnr_db (of the training view just seen), gaussians and, where views are ``checked``,
+            now and then held_out_db.
         device: ``cpu``, or ``cuda`` through gsplat.
         threads: Of the CPU rasteriser; None leaves it as it is.
+        checked: Views that are not learned from, to tell on the way how well they are shown.
 
     Returns:
-        Background, actors and the sky that the views saw.
+        Background, actors, the sky that the views saw, and their exposures.
 
     Raises:
         InputError: No view, nothing to start from, or a folder begun with other views or another recipe.
@@ -84,12 +87,15 @@ def fit(
     run = SplatFit(views, begin, recipe, scene_id, device, threads, folder)
     while run.step < recipe.steps:
         numbers = run.update()
+        if checked and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
+            numbers["held_out_db"] = run.shows_db(checked)
         if report is not None:
             report(run.step, numbers)
         if folder is not None and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
             run.save()
     background, actors = run.model.clouds()
-    return Reconstruction(background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+    gains = tuple((float(r), float(g), float(b)) for r, g, b in run.exposure.gains())
+    return Reconstruction(background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)), gains)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +172,20 @@ class SplatFit:
         self._control_density()
         psnr = psnr_db(rgb.detach().clamp(0, 1).cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0)
         return {"loss": float(loss.detach()), "psnr_db": psnr, "gaussians": len(self.model)}
+
+    @torch.no_grad()
+    def shows_db(self, views: Sequence[PosedView]) -> float:
+        """Return the mean PSNR of views, of the pixels that count, each by its own gain."""
+        found = []
+        for view in views:
+            target = _target(0, view, self.model, self.sky, str(self.model.node.device), self.recipe)
+            splats, _ = self.model.placed(target.motion, self.recipe.sh_size_at(self.step))
+            out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
+            rgb = (out.rgb * torch.tensor(view.gain)).clamp(0, 1)
+            shown = rgb if target.counts is None else torch.where(target.counts, rgb, target.rgb)
+            share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
+            found.append(psnr_db(shown.cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0) + 10 * float(np.log10(share)))
+        return float(np.mean(found))
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""

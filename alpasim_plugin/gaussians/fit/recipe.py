@@ -110,6 +110,14 @@ class SplatRecipe:
         return cls(steps=1500)
 
     @classmethod
+    def street(cls) -> SplatRecipe:
+        """Return the recipe of a recorded street: what three minutes of two cores allow (docs/experiments/real-fit.md)."""
+        return cls(
+            steps=1800, points=50_000, cap=80_000, start_size=0.8, coarse_share=0.5, depth_weight=0.05, needle_weight=0.02,
+            lr_exposure=1e-3, sky_weight=0.2,
+        )  # fmt: skip
+
+    @classmethod
     def under_trained(cls, seed: int = 0) -> SplatRecipe:
         """Return the recipe of an under-trained reconstruction (paper, App. A): few Gaussians and views, stopped early.
 

@@ -46,11 +46,13 @@ class Reconstruction:
         background: World coordinates.
         actors: Actor id to Gaussians in its box frame; an actor that no view showed well enough is missing.
         sky: What stands behind everything; black where the views had no sky.
+        gains: Of the views that it was fitted to, in their order: red, green and blue of each over the model's; not written with it.
     """
 
     background: GaussianCloud
     actors: Mapping[str, GaussianCloud]
     sky: Sky
+    gains: tuple[tuple[float, float, float], ...] = ()
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
