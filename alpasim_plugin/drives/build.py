@@ -15,6 +15,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
+from alpasim_plugin.drives.correcting import with_corrected_poses
 from alpasim_plugin.drives.fitting import fitted
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
@@ -90,6 +91,8 @@ def import_drive(
     if out.exists():
         return _finished(out, key)
     work = out.with_name(f".{out.name}.unfinished")
+    tell("correcting poses", 0, 1)
+    drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
     shown = _shown(drive, placed)

@@ -10,8 +10,7 @@ import torch
 
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.drives.source import Points
-from alpasim_plugin.gaussians.fit.loop import fit
-from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -44,8 +43,15 @@ def fitted(
         The model, and the exposure of each view by its name.
     """
     torch.set_num_threads(1)
-    recipe = SplatRecipe(steps=600, cap=30_000, seed=SEED)
     near = points.chosen(np.asarray(points.spread < np.percentile(points.spread, 90)))
     start = cloud_from_points(near.xyz, near.rgb)
-    model = fit(views, start, recipe, scene_id=scene_id, folder=folder, report=lambda step, numbers: tell("fitting", step, recipe.steps))
-    return model, {}
+    done = fit_drive(
+        views, start, kept=kept, boxes=boxes, scene_id=scene_id, folder=folder, seed=SEED,
+        report=lambda stage, at, all, numbers: tell(_words(stage, numbers), at, all),
+    )  # fmt: skip
+    return done.model, dict(done.exposures)
+
+
+def _words(stage: str, numbers: Mapping[str, float]) -> str:
+    """Return a stage with how well held-out photographs are shown, where that was just measured."""
+    return f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB" if "held_out_db" in numbers else stage
