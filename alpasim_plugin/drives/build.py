@@ -150,7 +150,8 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     front = drive.of(drive.front)
     if drive.points is not None:
         return drive.points
-    points = triangulated(front, lambda done, all: tell("matching photographs", done, all), str(folder))
+    tell("following points", 0, 1)
+    points = triangulated(front, str(folder))
     tell("measuring the road", 0, 1)
     rough = place(drive, points)
     if rough.strip is None:

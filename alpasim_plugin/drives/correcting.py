@@ -21,7 +21,7 @@ FARTHEST_M, FARTHEST_RAD = 0.5, 0.05  # of a correction; more is another fault t
 def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     """Return the drive with the front camera's poses adjusted to its photographs, and its other cameras moved along, as a rig is rigid.
 
-    Only poses in metres are held to what they were by a prior in metres; a drive whose points or ego poses were measured apart keeps its own.
+    Poses in metres are held to what they were; a drive whose points or ego poses were measured apart keeps its own.
     """
     if drive.metric is None or drive.points is not None or drive.ego is not None or drive.kind in ("colmap", "sfm"):
         return drive

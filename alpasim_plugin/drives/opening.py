@@ -10,7 +10,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
-from alpasim_plugin.drives.points import Matched, agreeing
+from alpasim_plugin.drives.points import agreeing
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
 from alpasim_plugin.gaussians.sh import C0
@@ -80,19 +80,14 @@ def recognised_axes(folder: Path) -> tuple[str, str]:
     Raises:
         InputError: Both fit, or neither.
     """
-    inliers = {}
-    for axes in AXES:
-        _, listed = read_pictures(folder, axes)
-        there = sorted(present(folder, listed)[0], key=lambda one: one.file.name)
-        chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
-        inliers[axes] = sum(_fits(there[i], there[i + 1]) for i in chosen)
+    _, listed = read_pictures(folder, "opencv")
+    there = sorted(present(folder, listed)[0], key=lambda one: one.file.name)
+    chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
+    counts = np.sum([agreeing(there[i], there[i + 1], list(AXES.values())) for i in chosen], axis=0)
+    inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))
     best, other = sorted(inliers, key=lambda axes: -inliers[axes])
     if inliers[best] < FEWEST or inliers[best] < CLEARLY * inliers[other]:
         found = f"no 'axes', and photographs fit together alike with {best} ({inliers[best]} matches) and {other} ({inliers[other]})"
         do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file'
         raise InputError(DOING, str(folder / FILE), found, do)
     return best, f"axes recognised as {best}: {inliers[best]} matches of neighbouring photographs fit, {inliers[other]} with {other}"
-
-
-def _fits(one: Picture, other: Picture) -> int:
-    return agreeing(Matched(one, one.rgb()), Matched(other, other.rgb()))
