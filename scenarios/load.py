@@ -122,6 +122,8 @@ def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
         alpasim_map=drive.alpasim_map,
         source_part=kind,
         varied=drawn.varied,
+        recording=drive.recording,
+        model=drive.model,
         stop_at_path_end=timing.stop_at_path_end,
     )
 

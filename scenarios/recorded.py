@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, HeightField, LaneMap, Route, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, HeightField, LaneMap, Photograph, Route, Trajectory, Vehicle
 from scenarios.reading import SourceFiles
 
 
@@ -21,7 +21,7 @@ class RecordedLog:
     """
 
     scene_id: str
-    source: str  # yaml | argoverse | commonroad | cosmos | usdz
+    source: str  # yaml | argoverse | commonroad | cosmos | drive | usdz
     lane_map: LaneMap
     ground: HeightField
     ego_log: Trajectory  # rig poses, world
@@ -34,6 +34,8 @@ class RecordedLog:
     first_frame_us: int | None = None  # when the first recorded camera frame ends, where the source says it
     alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
     route: Route | None = None  # None: the recorded path, carried on along the lanes
+    recording: tuple[Photograph, ...] = ()  # see `Scenario.recording`
+    model: str | None = None  # see `Scenario.model`
 
 
 MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors

@@ -256,6 +256,12 @@ class ScenarioSpec(Part):
     def _one_source(self) -> ScenarioSpec:
         if (self.road is None) == (self.log is None):
             raise ValueError("give exactly one of 'road' and 'log' | add road: {segments: [...]} or log: {commonroad: FILE}")
+        if self.log is not None and self.log.drive is not None:
+            given = [
+                key for key in ("degradation", "background", "environment") if getattr(self, key) != type(self).model_fields[key].default
+            ]
+            if given:
+                raise ValueError(f"{given[0]} with log.drive, whose look is its reconstruction's | remove {given[0]}")
         return self
 
 
@@ -281,6 +287,7 @@ def models() -> dict[str, type[BaseModel]]:
         "variations.KEY (a range)": RangeSpec, "variations.KEY (a choice)": ChoiceSpec,
     }  # fmt: skip
     return out
+
 
 if __name__ == "__main__":
     SCHEMA_FILE.write_text(json_schema(), encoding="utf-8")

@@ -126,7 +126,7 @@ class RoadSpec(Part):
     segments: tuple[SegmentSpec, ...] = Field(min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order.")
 
 
-SHIPPED = ("argoverse", "commonroad", "cosmos", "usdz")
+SHIPPED = ("argoverse", "commonroad", "cosmos", "drive", "usdz")
 
 
 class LogSpec(Part):
@@ -135,6 +135,7 @@ class LogSpec(Part):
     argoverse: str | None = Field(default=None, min_length=1, description="Folder of one Argoverse 2 log.")
     commonroad: str | None = Field(default=None, min_length=1, description="CommonRoad XML file.")
     cosmos: str | None = Field(default=None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip.")
+    drive: str | None = Field(default=None, min_length=1, description="Folder that simrun import has written.")
     usdz: str | None = Field(default=None, min_length=1, description="AlpaSim scene file.")
     source: str | None = Field(
         default=None, min_length=1, description="A source of an installed package, or package.module:Class; it reads path."

@@ -16,6 +16,7 @@ from scenarios.schema_parts import SHIPPED
 from scenarios.variation import Drawn
 
 DOING = "reading a scenario"
+DRIVE_FILE = "drive.json"  # of an imported drive, as `scenarios.drive` has it
 
 
 class Argoverse(Source):
@@ -64,6 +65,22 @@ class Cosmos(Source):
         from scenarios.cosmos import read_cosmos
 
         return read_cosmos(path)
+
+
+class ImportedDrive(Source):
+    """Recorded drives that ``simrun import`` has written."""
+
+    help = "folder that simrun import has written"
+
+    def matches(self, path: Path) -> bool:
+        """Look for the drive's own file."""
+        return (path / DRIVE_FILE).is_file()
+
+    def read(self, path: Path, ego: str | None) -> RecordedLog:
+        """Read a drive; the ego is the recording vehicle."""
+        from scenarios.drive import read_drive
+
+        return read_drive(path)
 
 
 class Usdz(Source):

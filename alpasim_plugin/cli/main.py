@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 # Verb -> module of this package and its function, by the groups of the help page. Only the verb that was typed is imported: some need
 # torch, which takes seconds to load.
 GROUPS: dict[str, dict[str, str]] = {
+    "Bring in": {"import": "import_drive:app"},
     "Drive": {"run": "run:run", "decide": "decide:decide", "fork": "fork:fork", "probe": "fork:probe", "refine": "refine:refine"},
     "Read results": {
         "score": "score:score", "compare": "compare:compare", "aggregate": "aggregate:aggregate", "gate": "gate:gate",

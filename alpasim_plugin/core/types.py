@@ -166,6 +166,7 @@ class Photograph:
     K: F64  # (3, 3) pixels
     T_world_camera: F64  # (4, 4)
     path: str  # of the picture
+    use: Literal["fitted", "held-out", "never-fitted"] = "fitted"  # by the reconstruction; never-fitted: all of a further camera
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gain of each channel, by which the reconstruction explains this picture
 
 
@@ -285,7 +286,7 @@ class Scenario:
     """A complete test case, the same type for every source."""
 
     scene_id: str
-    source: str  # yaml | argoverse | commonroad | cosmos | usdz
+    source: str  # yaml | argoverse | commonroad | cosmos | drive | usdz
     seed: int  # scene seed: geometry, textures, scripted actors
     lane_map: LaneMap
     ground: HeightField
@@ -309,6 +310,7 @@ class Scenario:
     source_part: str | None = None  # the source that read the log, as named; None: a built road
     varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # key of the scenario file -> (as written, as drawn by the seed)
     recording: tuple[Photograph, ...] = ()  # the drive's photographs, of an imported drive
+    model: str | None = None  # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and `clean` is refused
     stop_at_path_end: bool = True  # a rollout ends where the recorded path does, unless the recorded car stands there
 
     @property

@@ -47,9 +47,16 @@ class CleanRenderer(Renderer):
 
     Attributes:
         stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
+
+    Raises:
+        InputError: Nothing was built: the scenario is an imported drive.
     """
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
+        if scenario.model is not None:
+            found = "a recorded drive: nothing was built, so there is no built truth to show"
+            do = "use 3dgs; photographs are the truth of a recorded drive (simrun bench real)"
+            raise InputError("rendering the scene as built", scenario.scene_id, found, do)
         self.scenario, self.seed, self.threads = scenario, seed, threads
         self.backend = backend_of(device)
         self.scene = scene_of(scenario)

@@ -22,6 +22,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneN
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory, scene_of
+from alpasim_plugin.renderers.imported import ImportedRenderer
 from alpasim_plugin.renderers.reconstruction_files import read_model
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, recipe_of, reconstruction_key
 from alpasim_plugin.renderers.recorded import built_recording
@@ -65,7 +66,9 @@ class ReconstructionRenderer(Renderer):
 
 
 def reconstruction_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-    """Make the renderer ``3dgs``: what the scenario's degradation names."""
+    """Make the renderer ``3dgs``: the model of an imported drive, and otherwise what the scenario's degradation names."""
+    if scenario.model is not None:
+        return ImportedRenderer(scenario, device, threads)
     amount = scenario.degradation
     if amount.kind == "none" or (amount.kind == "surrogate" and amount.severity == 0):
         return CleanRenderer(scenario, seed, device, threads)

@@ -1,32 +1,37 @@
-"""The frames of the recorded drive that a renderer declares, for a fixer to look at.
+"""The frames of the recorded drive that a renderer declares, for a fixer to look at; each is read when it is first needed.
 
-A scene that was built has no photographs: its recording is what its cameras would have taken along the log, the built scene itself, twice a
-second. The poses are those that the reconstruction believes, with the errors of its registration, so a recorded frame is no better placed
-than a user's own.
+Of an imported drive they are the photographs that its model was fitted to. A scene that was built has no photographs: its recording is what
+its cameras would have taken along the log, the built scene itself, twice a second. The poses are those that the reconstruction believes,
+with the errors of its registration, so a recorded frame is no better placed than a user's own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, RecordedFrame, Scenario
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Photograph, RecordedFrame, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
+DOING = "reading a recorded photograph"
 INTERVAL_US, FIRST_US = 500_000, 50_000  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
 POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
 Model = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]  # renders a view of the reconstruction
+DepthFrom = Callable[[PinholeCamera, Mapping[str, F64]], F32]  # camera, actor poses -> depth (H, W) metres, 0 where there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +99,52 @@ def _frame(
     believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
     actors = dict(log_actors(scenario, t_us))
     return RecordedFrame(t_us, spec.name, spec.K, T_world_believed, actors, _Shot(scene, model, true, believed, actors).read)
+
+
+def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[RecordedFrame, ...]:
+    """Return the photographs that the model was fitted to; those held out or of another camera stay unseen, so that they can judge.
+
+    Args:
+        scenario: Of an imported drive.
+        depth_from: What the renderer sees from a camera.
+
+    Returns:
+        In order of time, each at the size at which the scenario renders its camera, where that is smaller, with its field of view. Reading
+        one raises `InputError` where its file is missing or damaged.
+    """
+    widths = {camera.name: camera.width for camera in scenario.cameras}
+    frames = []
+    for one in of_use(scenario, "fitted"):
+        camera = photograph_camera(one, widths.get(one.camera, one.width))
+        actors = log_actors(scenario, one.t_us)
+        read = partial(_read, one, camera, partial(depth_from, camera, actors))
+        frames.append(RecordedFrame(one.t_us, one.camera, camera.K, one.T_world_camera, actors, read))
+    return tuple(frames)
+
+
+def photograph_camera(one: Photograph, width: int) -> PinholeCamera:
+    """Return a photograph's camera with so many pixels across, never more than it has."""
+    w = min(width, one.width)
+    h = max(1, round(one.height * w / one.width))
+    return PinholeCamera.from_pose(w, h, np.diag([w / one.width, h / one.height, 1.0]) @ one.K, one.T_world_camera)
+
+
+def photograph_picture(one: Photograph, camera: PinholeCamera) -> U8:
+    """Read a photograph at the size of its camera ``(H, W, 3)``.
+
+    Raises:
+        InputError: The file is missing or damaged.
+    """
+    rgb = np.asarray(read_image(Path(one.path), DOING)[..., ::-1], np.uint8)
+    size = camera.width, camera.height
+    small = rgb if size == (one.width, one.height) else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(small, dtype=np.uint8)
+
+
+def of_use(scenario: Scenario, use: str) -> Sequence[Photograph]:
+    """Return the drive's photographs of one use, in order of time."""
+    return sorted((one for one in scenario.recording if one.use == use), key=lambda one: (one.t_us, one.camera))
+
+
+def _read(one: Photograph, camera: PinholeCamera, depth: Callable[[], F32]) -> tuple[U8, F32]:
+    return photograph_picture(one, camera), depth()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud, build_cloud, logit, sigmoid
-from alpasim_plugin.io.atomic import atomic_file
+from alpasim_plugin.io.atomic import atomic_file, write_bytes
 from alpasim_plugin.io.limits import GAUSSIANS
 from alpasim_plugin.io.reading.files import open_regular
 
@@ -86,6 +86,19 @@ def write_ply(path: Path | str, cloud: GaussianCloud, precision: Precision = "fl
     with atomic_file(path, "writing a PLY file") as partial, partial.open("wb") as stream:
         stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
         stream.write(rows.tobytes())
+
+
+def write_points(path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> None:
+    """Write points ``(N, 3)`` with colours ``(N, 3)`` as a binary PLY."""
+    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.empty(len(xyz), dtype=kinds)
+    for i, name in enumerate("xyz"):
+        rows[name] = xyz[:, i]
+    for i, name in enumerate(("red", "green", "blue")):
+        rows[name] = rgb[:, i]
+    names = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *names, "end_header", ""])
+    write_bytes(path, header.encode() + rows.tobytes())
 
 
 def ply_rows(cloud: GaussianCloud, precision: Precision = "float32") -> NDArray[np.void]:

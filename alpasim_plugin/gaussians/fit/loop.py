@@ -18,12 +18,23 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.fit.model import NAMES, Motion, RowAdam, ScreenGradients, SplatModel, densify, reset_opacities
+from alpasim_plugin.gaussians.fit.model import (
+    NAMES,
+    Exposure,
+    Motion,
+    RowAdam,
+    ScreenGradients,
+    SplatModel,
+    densify,
+    needles,
+    reset_opacities,
+)
 from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
-from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.fit.views import PosedView, halved
+from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.io.atomic import write_safetensors
@@ -31,6 +42,7 @@ from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.io.reading.arrays import START_ANEW, read_checkpoint
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
+DEPTH_CLIP = 0.5  # of a share: a measured depth may be wrong altogether
 SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves
 
 
@@ -44,6 +56,7 @@ def fit(
     report: Report | None = None,
     device: str = "cpu",
     threads: int | None = None,
+    checked: Sequence[PosedView] = (),
 ) -> Reconstruction:
     """Fit a background, and the actors that ``start`` holds, to posed views.
 
@@ -53,12 +66,14 @@ def fit(
         recipe: Amounts, rates and schedule.
         scene_id: Key of the random streams, with ``recipe.seed``: order of views and splits.
         folder: Receives checkpoints; the same call with the same folder continues, and ends with the same bits. None keeps none.
-        report: Called after every update with loss, psnr_db (of the training view just seen) and gaussians.
+        report: Called after every update with loss, psnr_db (of the training view just seen), gaussians and, where views are ``checked``,
+            now and then held_out_db.
         device: ``cpu``, or ``cuda`` through gsplat.
         threads: Of the CPU rasteriser; None leaves it as it is.
+        checked: Views that are not learned from, to tell on the way how well they are shown.
 
     Returns:
-        Background, actors and the sky that the views saw.
+        Background, actors, the sky that the views saw, and their exposures.
 
     Raises:
         InputError: No view, nothing to start from, or a folder begun with other views or another recipe.
@@ -72,12 +87,15 @@ def fit(
     run = SplatFit(views, begin, recipe, scene_id, device, threads, folder)
     while run.step < recipe.steps:
         numbers = run.update()
+        if checked and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
+            numbers["held_out_db"] = run.shows_db(checked)
         if report is not None:
             report(run.step, numbers)
         if folder is not None and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
             run.save()
     background, actors = run.model.clouds()
-    return Reconstruction(background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+    gains = tuple((float(r), float(g), float(b)) for r, g, b in run.exposure.gains())
+    return Reconstruction(background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)), gains)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +110,8 @@ class _Target:
     counts: Tensor | None  # (H, W, 1) bool
     motion: Motion
     ssim: SsimTarget
+    depth: Tensor | None  # (H, W) metres, 0 where unknown
+    index: int  # of the view
 
 
 class SplatFit:
@@ -116,10 +136,13 @@ class SplatFit:
         self.adam = RowAdam(self.model.params)
         self.gradients = ScreenGradients(len(self.model), device)
         self.step = 0
-        self.targets = [_target(view, self.model, self.sky, device) for view in views]
+        self.targets = [_target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(views)]
+        small = [halved(view) for view in views] if recipe.coarse_share > 0 else []
+        self.coarse = [_target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(small)]
+        self.exposure = Exposure(np.array([view.gain for view in views]), device)
         self._facts = json.dumps({"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)}, sort_keys=True)
         if folder is not None and (folder / STATE_FILE).exists():
-            self.step = load_state(folder, self.model, self.adam, self.gradients, self._facts)
+            self.step = load_state(folder, self.model, self.adam, self.gradients, self.exposure, self._facts)
 
     def update(self) -> dict[str, float]:
         """Learn from one view.
@@ -130,8 +153,11 @@ class SplatFit:
         target, recipe = self._next_view(), self.recipe
         splats, rows = self.model.placed(target.motion, recipe.sh_size_at(self.step))
         out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
-        rgb = out.rgb if target.counts is None else torch.where(target.counts, out.rgb, target.rgb)
-        loss = _loss(rgb, out.alpha, target, recipe)
+        lit = out.rgb if self.exposure.plain else out.rgb * self.exposure.gain(target.index)
+        rgb = lit if target.counts is None else torch.where(target.counts, lit, target.rgb)
+        loss = _loss(rgb, out, target, recipe)
+        if recipe.needle_weight > 0:
+            loss = loss + recipe.needle_weight * needles(splats.log_scales[out.screen.radii > 0], recipe.needle_ratio)
         if not torch.isfinite(loss):
             self._stop(target, f"loss {float(loss.detach())}")
         loss.backward()  # type: ignore[no-untyped-call]
@@ -141,20 +167,36 @@ class SplatFit:
         assert out.screen.gradient_norm is not None  # the backward pass has run
         self.gradients.add(rows, out.screen.gradient_norm, out.screen.radii, target.camera.width)
         self.adam.update(self.model.params, self._rates())
+        self.exposure.update(recipe.lr_exposure)
         self.step += 1
         self._control_density()
         psnr = psnr_db(rgb.detach().clamp(0, 1).cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0)
         return {"loss": float(loss.detach()), "psnr_db": psnr, "gaussians": len(self.model)}
 
+    @torch.no_grad()
+    def shows_db(self, views: Sequence[PosedView]) -> float:
+        """Return the mean PSNR of views, of the pixels that count, each by its own gain."""
+        found = []
+        for view in views:
+            target = _target(0, view, self.model, self.sky, str(self.model.node.device), self.recipe)
+            splats, _ = self.model.placed(target.motion, self.recipe.sh_size_at(self.step))
+            out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
+            rgb = (out.rgb * torch.tensor(view.gain)).clamp(0, 1)
+            shown = rgb if target.counts is None else torch.where(target.counts, rgb, target.rgb)
+            share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
+            found.append(psnr_db(shown.cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0) + 10 * float(np.log10(share)))
+        return float(np.mean(found))
+
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
         assert self.folder is not None
-        save_state(self.folder, self.model, self.adam, self.gradients, self.step, self._facts)
+        save_state(self.folder, self.model, self.adam, self.gradients, self.exposure, self.step, self._facts)
 
     def _next_view(self) -> _Target:
         """Return the view of this step: all in a random order, then all in another."""
         turn, i = divmod(self.step, len(self.targets))
-        return self.targets[int(stream(self.scene_id, self.recipe.seed, "fit.order", turn).permutation(len(self.targets))[i])]
+        targets = self.coarse if self.step < self.recipe.coarse_share * self.recipe.steps else self.targets
+        return targets[int(stream(self.scene_id, self.recipe.seed, "fit.order", turn).permutation(len(self.targets))[i])]
 
     def _rates(self) -> dict[str, float]:
         r = self.recipe
@@ -178,7 +220,7 @@ class SplatFit:
         raise InfrastructureError("fitting Gaussians", f"view {target.name!r}, update {self.step}", found, do)
 
 
-def _target(view: PosedView, model: SplatModel, sky: Sky | None, device: str) -> _Target:
+def _target(index: int, view: PosedView, model: SplatModel, sky: Sky | None, device: str, recipe: SplatRecipe) -> _Target:
     camera = view.camera
     T = camera.T_camera_world.copy()
     T[:3, 3] += T[:3, :3] @ model.origin
@@ -193,14 +235,29 @@ def _target(view: PosedView, model: SplatModel, sky: Sky | None, device: str) ->
         None if view.mask is None else torch.as_tensor(view.mask, device=device)[..., None],
         model.motion(view.actors),
         SsimTarget(rgb),
+        None if view.depth is None or recipe.depth_weight == 0 else torch.as_tensor(view.depth, device=device),
+        index,
     )
 
 
-def _loss(rgb: Tensor, alpha: Tensor, target: _Target, recipe: SplatRecipe) -> Tensor:
-    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), and the opacity that stands before the sky."""
+def _loss(rgb: Tensor, out: GradientOutput, target: _Target, recipe: SplatRecipe) -> Tensor:
+    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), the opacity that stands before the sky, and the error of depth."""
     w = recipe.ssim_weight
     loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - target.ssim.ssim(rgb))
-    return loss if target.sky is None else loss + recipe.sky_weight * (alpha * target.sky).mean()
+    if target.sky is not None:
+        loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
+    if target.depth is not None:
+        loss = loss + recipe.depth_weight * _depth_error(out, target.depth)
+    return loss
+
+
+def _depth_error(out: GradientOutput, depth: Tensor) -> Tensor:
+    """Return the mean difference of inverse depths as a share of the true one, over pixels of known depth, at most `DEPTH_CLIP` each."""
+    rows, columns = torch.nonzero(depth, as_tuple=True)
+    if not len(rows):
+        return out.depth.new_zeros(())
+    off = depth[rows, columns] / out.depth[rows, columns].clamp(min=0.1) - 1
+    return off.abs().clamp(max=DEPTH_CLIP).mean()
 
 
 def _digest(views: Sequence[PosedView], start: Start) -> str:
@@ -211,7 +268,7 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
 
     for view in views:
-        for array in (view.rgb, view.camera.K, view.camera.T_camera_world, view.sky, view.mask):
+        for array in (view.rgb, view.camera.K, view.camera.T_camera_world, view.sky, view.mask, np.array(view.gain)):
             add(array)
         for name, T in sorted(view.actors.items()):
             digest.update(name.encode())
@@ -225,16 +282,19 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
 STATE_FILE = "state.safetensors"
 
 
-def save_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, step: int, facts: str) -> None:
+def save_state(
+    folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, exposure: Exposure, step: int, facts: str
+) -> None:
     """Write everything that later updates depend on; the file appears complete or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {"node": model.node, "gradients.total": gradients.total, "gradients.count": gradients.count}
+    tensors |= {f"exposure.{name}": value for name, value in exposure.state().items()}
     for name in NAMES:
         tensors |= {f"value.{name}": model.params[name].detach(), f"first.{name}": adam.first[name], f"second.{name}": adam.second[name]}
     write_safetensors(folder / STATE_FILE, tensors, {"step": str(step), "adam_step": str(adam.step), "facts": facts})
 
 
-def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, facts: str) -> int:
+def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, exposure: Exposure, facts: str) -> int:
     """Put a saved state into objects made from the same start, and return the number of updates made.
 
     Raises:
@@ -250,5 +310,6 @@ def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: Screen
         adam.first = {name: tensors[f"first.{name}"] for name in NAMES}
         adam.second = {name: tensors[f"second.{name}"] for name in NAMES}
         adam.step = int(meta["adam_step"])
+        exposure.restore({name.removeprefix("exposure."): t for name, t in tensors.items() if name.startswith("exposure.")})
         gradients.total, gradients.count = tensors["gradients.total"], tensors["gradients.count"]
         return int(meta["step"])

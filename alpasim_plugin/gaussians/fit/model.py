@@ -208,6 +208,65 @@ class RowAdam:
         self.second[name].zero_()
 
 
+EXPOSURE_PULL = 1.0  # towards where a gain began, per update, in rates
+
+
+class Exposure:
+    """The gain of each view's colours over the model's, learned with Adam and held to where it began; it keeps its mean over the views.
+
+    Args:
+        begin: ``(V, 3)`` of red, green and blue.
+        device: Of the tensors.
+
+    Attributes:
+        log_gain: ``(V, 3)``.
+        plain: All gains are 1 and stay so.
+    """
+
+    def __init__(self, begin: F64, device: str | torch.device = "cpu") -> None:
+        self.begin = torch.as_tensor(np.log(begin), dtype=torch.float32, device=device)
+        self.log_gain = self.begin.clone().requires_grad_()
+        self.plain = bool((self.begin == 0).all())
+        self._adam = RowAdam({"log_gain": self.log_gain})
+
+    def gain(self, view: int) -> Tensor:
+        """Return the gain ``(3,)`` of a view, with graph."""
+        return self.log_gain[view].exp()
+
+    def gains(self) -> F64:
+        """Return all gains ``(V, 3)``."""
+        return np.exp(self.log_gain.detach().cpu().double().numpy())
+
+    @torch.no_grad()
+    def update(self, rate: float) -> None:
+        """Make one update; a rate of 0 makes none."""
+        if rate > 0:
+            self._adam.update({"log_gain": self.log_gain}, {"log_gain": rate})
+            self.log_gain.lerp_(self.begin, EXPOSURE_PULL * rate)
+            self.log_gain -= (self.log_gain - self.begin).mean(dim=0)
+        elif self.log_gain.grad is not None:
+            self.log_gain.grad = None
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what `restore` needs."""
+        return {
+            "value": self.log_gain.detach(), "first": self._adam.first["log_gain"], "second": self._adam.second["log_gain"],
+            "step": torch.tensor(self._adam.step),
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Take over a saved state."""
+        self.log_gain = state["value"].clone().requires_grad_()
+        self._adam.first, self._adam.second = {"log_gain": state["first"].clone()}, {"log_gain": state["second"].clone()}
+        self._adam.step = int(state["step"])
+
+
+def needles(log_scales: Tensor, ratio: float) -> Tensor:
+    """Return by how much, in logarithms, the longest axes of Gaussians ``(N, 3)`` exceed ``ratio`` times the middle ones: the mean."""
+    axes = log_scales.sort(dim=1).values
+    return (axes[:, 2] - axes[:, 1] - math.log(ratio)).clamp(min=0).mean()
+
+
 SPLIT_SHRINK = 1.6  # of scales when a Gaussian becomes two
 
 

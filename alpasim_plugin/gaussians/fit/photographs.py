@@ -1,17 +1,18 @@
-"""Read and write photographs with poses: a folder of images and a ``transforms.json``.
+"""Read and write photographs with poses: a folder of images and a ``transforms.json``. Every reader of photographs undistorts here.
 
 The file's keys are those of Instant-NGP and nerfstudio, which many tools write (COLMAP's poses through their converters, for example):
 
     {"axes": "opencv", "w": 256, "h": 144, "fl_x": 210.0, "fl_y": 210.0, "cx": 128.0, "cy": 72.0, "k1": -0.1,
      "ply_file_path": "points.ply",
      "frames": [{"file_path": "images/0000.png", "transform_matrix": [[...], [...], [...], [0, 0, 0, 1]],
-                 "t_us": 100000, "sky_path": "sky/0000.png", "mask_path": "masks/0000.png"}]}
+                 "t_us": 100000, "camera": "front", "sky_path": "sky/0000.png", "mask_path": "masks/0000.png"}]}
 
 ``transform_matrix`` maps camera points to the world. ``axes`` says how the camera's axes lie: ``opencv`` is x right, y down, z forward;
-``opengl`` is x right, y up, z back (what Instant-NGP and nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3)
-may stand in a frame instead; pictures are freed of their distortion as they are read. Optional: ``t_us`` places the actors of a scenario;
-``sky_path`` is white where the image shows sky; ``mask_path`` is black where pixels do not count; ``ply_file_path`` names points to start
-from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
+``opengl`` is x right, y up, z back (what Instant-NGP and nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3;
+with ``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x``, radians, may stand for the focal
+length. Pictures are freed of their distortion as they are read. Optional: ``t_us`` places the actors of a scenario; ``camera`` names the
+camera; ``sky_path`` is white where the image shows sky; ``mask_path`` is black where pixels do not count; ``ply_file_path`` names points to
+start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,25 +31,65 @@ from alpasim_plugin.core.types import F64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply_element, read_ply_header
+from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.limits import SOURCE_BYTES
 from alpasim_plugin.io.reading import read_bytes, read_json_object
 from alpasim_plugin.io.reading.files import as_shape
-from alpasim_plugin.io.reading.images import decode_image
+from alpasim_plugin.io.reading.images import check_image, decode_image, picture_fault
 
 FILE = "transforms.json"
 DOING = "reading photographs"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}  # the file's camera axes to ours
-LENS_MODELS = ("OPENCV", "PINHOLE")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # the order of OpenCV
+COEFFICIENTS = {  # of each lens model, in the order of OpenCV
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"), "PINHOLE": ("k1", "k2", "p1", "p2", "k3"), "SIMPLE_PINHOLE": (), "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}  # fmt: skip
 EXTENT_M = 4.0  # structure from motion has no unit: the camera that is farthest from their middle is put so far from it
 SIDE_PX = 16  # sides are multiples of this, as fixers need
 RIGID = 1e-12  # a rotation this exact is taken as it is written
-_FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
 
 ActorsAt = Callable[[int], Mapping[str, F64]]  # time in microseconds -> actor id to T_world_box
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A photograph in a file, its lens and where it was taken.
+
+    Attributes:
+        file: Of the photograph.
+        lens: Of its camera.
+        T_world_camera: ``(4, 4)``, axes of OpenCV.
+        where: The place that names it, for messages.
+        t_us: When it was taken; None where that is unknown.
+        camera: Name of its camera; None where that is unknown.
+        more: What its file says besides.
+    """
+
+    file: Path
+    lens: Lens
+    T_world_camera: F64
+    where: str
+    t_us: int | None
+    camera: str | None
+    more: Mapping[str, Any]
+
+    def rgb(self) -> U8:
+        """Return the photograph without distortion, ``(H, W, 3)`` uint8 sRGB.
+
+        Raises:
+            InputError: The file is missing, damaged, of another size, or in other colours than grey or RGB.
+        """
+        return np.ascontiguousarray(self.lens.straightened(read_photograph(self.file, self.lens, self.where)[..., ::-1]))
+
+    def view(self) -> PosedView:
+        """Return it as a view at full size."""
+        lens = self.lens
+        return PosedView(
+            PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), self.T_world_camera), self.rgb(), self.file.stem
+        )
 
 
 @dataclass(frozen=True)
@@ -66,6 +107,28 @@ class Photographs:
     listed: int
 
 
+def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any], list[Picture]]:
+    """Read what a ``transforms.json`` says, without opening its pictures.
+
+    Args:
+        folder: Holds the file.
+        axes: How the camera's axes lie where the file's ``axes`` does not say it; None refuses such a file.
+
+    Returns:
+        The document; its frames as pictures, in the file's order.
+
+    Raises:
+        InputError: The file or a key is missing, or something in it cannot be: names the frame and what was found.
+    """
+    path = folder / FILE
+    document, frames = _frames(path)
+    meant = document.get("axes", axes)
+    if not isinstance(meant, str) or meant not in AXES:
+        do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)'
+        raise InputError(DOING, f"{path}, key 'axes'", repr(meant), do)
+    return document, [_picture(folder, frame, f"{path}, frame {i}", AXES[meant]) for i, frame in enumerate(frames)]
+
+
 def read_views(folder: Path, actors_at: ActorsAt | None = None) -> tuple[list[PosedView], GaussianCloud | None]:
     """Read a folder of posed images at full size, in metres: ``axes`` must be there, because files of both kinds look alike.
 
@@ -79,22 +142,14 @@ def read_views(folder: Path, actors_at: ActorsAt | None = None) -> tuple[list[Po
     Raises:
         InputError: A file or key is missing, or something in them cannot be: names the frame and what was found.
     """
-    path = folder / FILE
-    document, frames = _frames(path)
-    axes = document.get("axes")
-    if not isinstance(axes, str) or axes not in AXES:
-        do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)'
-        raise InputError(DOING, f"{path}, key 'axes'", repr(axes), do)
-    if not frames:
-        raise InputError(DOING, str(path), "no frames", "list at least one frame")
+    document, pictures = read_pictures(folder)
+    if not pictures:
+        raise InputError(DOING, str(folder / FILE), "no frames", "list at least one frame")
     views = []
-    for i, frame in enumerate(frames):
-        where = f"{path}, frame {i}"
-        lens, pose = _lens(frame, where), _pose(frame, where, AXES[axes])
-        view = _view(folder, frame, where, lens, pose)
-        sky, mask = (_flags(folder, frame, key, where, lens) for key in ("sky_path", "mask_path"))
-        actors = actors_at(int(frame["t_us"])) if actors_at is not None and "t_us" in frame else {}
-        views.append(replace(view, sky=sky, mask=mask, actors=actors))
+    for picture in pictures:
+        sky, mask = (_flags(folder, picture, key) for key in ("sky_path", "mask_path"))
+        actors = actors_at(picture.t_us) if actors_at is not None and picture.t_us is not None else {}
+        views.append(replace(picture.view(), sky=sky, mask=mask, actors=actors))
     points = document.get("ply_file_path")
     return views, None if points is None else read_points(folder / points)
 
@@ -111,19 +166,26 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
     Raises:
         InputError: No such file, a key is missing, another lens model than OpenCV's, or fewer than two images exist.
     """
-    path = folder / FILE
     if width < SIDE_PX or width % SIDE_PX:
         raise InputError(DOING, f"width {width}", f"not a multiple of {SIDE_PX}", f"choose for example {16 * SIDE_PX}")
-    _, frames = _frames(path)
-    there = {f"{path}, frame {i}": frame for i, frame in enumerate(frames) if (folder / str(frame.get("file_path"))).is_file()}
-    missing = [str(frame.get("file_path")) for i, frame in enumerate(frames) if f"{path}, frame {i}" not in there]
+    _, pictures = read_pictures(folder, "opengl")
+    there, missing = present(folder, pictures)
+    poses = _scaled(np.array([picture.T_world_camera for picture in there]))
+    views = [_cut(replace(one, T_world_camera=pose).view(), width, one.where) for one, pose in zip(there, poses, strict=True)]
+    return Photographs(tuple(views), missing, len(pictures))
+
+
+def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], tuple[str, ...]]:
+    """Return the pictures whose files exist, and the names of the others.
+
+    Raises:
+        InputError: Fewer than two exist.
+    """
+    there = [picture for picture in pictures if picture.file.is_file()]
+    missing = tuple(picture.file.relative_to(folder).as_posix() for picture in pictures if not picture.file.is_file())
     if len(there) < 2:
-        raise InputError(DOING, str(folder), f"{len(there)} of {len(frames)} listed images exist", "give the images that the file names")
-    poses = _scaled(np.array([_pose(frame, where, AXES["opengl"]) for where, frame in there.items()]))
-    views = []
-    for (where, frame), pose in zip(there.items(), poses, strict=True):
-        views.append(_cut(_view(folder, frame, where, _lens(frame, where), pose), width, where))
-    return Photographs(tuple(views), tuple(missing), len(frames))
+        raise InputError(DOING, str(folder), f"{len(there)} of {len(pictures)} listed images exist", "give the images that the file names")
+    return there, missing
 
 
 def write_views(folder: Path, views: Sequence[PosedView]) -> None:
@@ -172,30 +234,6 @@ def resized(view: PosedView, width: int) -> PosedView:
     return PosedView(PinholeCamera(width, height, K, camera.T_camera_world), np.asarray(rgb, dtype=np.uint8), view.name)
 
 
-class _Lens(NamedTuple):
-    """What a frame says of its lens: the picture's size, intrinsics, and OpenCV's coefficients of distortion."""
-
-    width: int
-    height: int
-    K: F64
-    distortion: F64
-
-    def straight_K(self) -> F64:
-        """Return the intrinsics without distortion: what they show is all in the photograph."""
-        if not self.distortion.any():
-            return self.K
-        whole, _ = cv2.getOptimalNewCameraMatrix(self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0)
-        straight: F64 = np.asarray(whole, dtype=np.float64) + _FROM_CORNER
-        return straight
-
-    def straightened(self, image: U8) -> U8:
-        """Return an image freed of the distortion."""
-        if not self.distortion.any():
-            return image
-        whole = self.straight_K() - _FROM_CORNER
-        return np.asarray(cv2.undistort(image, self.K - _FROM_CORNER, self.distortion, None, whole), dtype=np.uint8)
-
-
 def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the document, and its frames with what it says for all of them."""
     document = read_json_object(path, DOING, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)")
@@ -203,37 +241,63 @@ def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return document, [{**document, **frame} for frame in frames]
 
 
-def _lens(frame: Mapping[str, Any], where: str) -> _Lens:
-    model = frame.get("camera_model", LENS_MODELS[0])
-    if model not in LENS_MODELS or frame.get("k4"):
-        found = f"lens model {model}" if model not in LENS_MODELS else "a coefficient k4"
+def _picture(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> Picture:
+    file, camera = _file(folder, frame, "file_path", where), frame.get("camera")
+    t_us = as_shape(int | None, frame.get("t_us"), f"{where}, t_us", DOING)
+    pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
+    return Picture(file, _lens(frame, file, where), pose, where, t_us, None if camera is None else str(camera), frame)
+
+
+def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
+    model = frame.get("camera_model", "OPENCV")
+    if model not in COEFFICIENTS or (frame.get("k4") and model != "OPENCV_FISHEYE"):
+        found = f"lens model {model}" if model not in COEFFICIENTS else "a coefficient k4"
         do = "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first (ns-process-data, colmap image_undistorter)"
         raise InputError(DOING, where, found, do)
+    do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/reconstruction.md)"
     try:
-        width, height = int(frame["w"]), int(frame["h"])
-        K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], dtype=np.float64)
-        distortion = np.array([float(frame.get(key) or 0.0) for key in COEFFICIENTS])
-        if not np.isfinite([*K.ravel(), *distortion]).all() or min(K[0, 0], K[1, 1]) <= 0:
-            raise ValueError("intrinsics that are not finite, or no focal length")
+        size = (
+            (frame["w"], frame["h"])
+            if "w" in frame or not file.is_file()
+            else check_image(read_bytes(file, DOING, SOURCE_BYTES), file, DOING)
+        )
+        width, height = int(size[0]), int(size[1])
+        if "fl_x" not in frame and "camera_angle_x" in frame:
+            focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
+            frame = {"fl_y": focal, "cx": width / 2, "cy": height / 2, **frame, "fl_x": focal}
+        K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame.get("fl_y", frame["fl_x"]), frame["cy"]], [0, 0, 1]], dtype=np.float64)
+        distortion = np.array([float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/reconstruction.md)"
         raise InputError(DOING, where, f"{type(error).__name__}: {error}", do) from error
-    return _Lens(width, height, K, distortion)
+    few = np.zeros(max(0, 4 - len(distortion)))  # OpenCV takes four at least
+    fisheye = model == "OPENCV_FISHEYE"
+    return Lens(width, height, K, np.concatenate([distortion, few]), "fisheye" if fisheye else "opencv").check(DOING, where, do)
 
 
-def _pose(frame: Mapping[str, Any], where: str, axes: F64) -> F64:
-    where = f"{where}, transform_matrix"
-    T = np.asarray(as_shape(list[list[float]], frame.get("transform_matrix"), where, DOING), dtype=np.float64)
+def rigid_pose(value: Any, where: str, doing: str = DOING) -> F64:
+    """Return a pose ``(4, 4)`` whose rotation is exact, of a matrix written with a few digits.
+
+    Raises:
+        InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or left-handed.
+    """
+    T = np.asarray(as_shape(list[list[float]], value, where, doing), dtype=np.float64)
+    if T.shape == (3, 4):
+        T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(DOING, where, f"shape {T.shape}", "give a finite matrix of 4 x 4")
+        found = "a number that is not finite" if T.shape == (4, 4) else f"shape {T.shape}"
+        raise InputError(doing, where, found, "give a finite matrix of 4 x 4")
     u, _, vt = np.linalg.svd(T[:3, :3])
     rotation = u @ vt
+    if np.linalg.det(rotation) < 0:
+        raise InputError(
+            doing, where, "its axes are left-handed (determinant -1)", "mirror one axis of the poses, and say in 'axes' how they lie"
+        )
     off = np.abs(T[:3, :3] - rotation).max()
-    if off > 1e-3 or np.linalg.det(rotation) < 0:
-        raise InputError(DOING, where, "its first three columns are no rotation", "give a rigid transform")
+    if off > 1e-3:
+        raise InputError(doing, where, f"its first three columns are no rotation (off by {off:.2g})", "give a rigid transform")
     if off > RIGID:  # what is written with a few digits is not quite a rotation
         T[:3, :3] = rotation
-    return np.asarray(T @ axes)
+    return T
 
 
 def _scaled(poses: F64) -> F64:
@@ -243,13 +307,6 @@ def _scaled(poses: F64) -> F64:
     if farthest > 0:
         out[:, :3, 3] = (out[:, :3, 3] - middle) * (EXTENT_M / farthest)
     return out
-
-
-def _view(folder: Path, frame: Mapping[str, Any], where: str, lens: _Lens, T_world_camera: F64) -> PosedView:
-    file = _file(folder, frame, "file_path", where)
-    rgb = lens.straightened(_read_image(file, where, lens, cv2.IMREAD_COLOR)[..., ::-1])
-    camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), T_world_camera)
-    return PosedView(camera, np.ascontiguousarray(rgb), file.stem)
 
 
 def _cut(view: PosedView, width: int, where: str) -> PosedView:
@@ -266,29 +323,39 @@ def _cut(view: PosedView, width: int, where: str) -> PosedView:
     return PosedView(camera, np.ascontiguousarray(small.rgb[top : top + kept]), view.name)
 
 
-def _flags(folder: Path, frame: Mapping[str, Any], key: str, where: str, lens: _Lens) -> Bool | None:
-    if key not in frame:
+def _flags(folder: Path, picture: Picture, key: str) -> Bool | None:
+    if key not in picture.more:
         return None
-    image = _read_image(_file(folder, frame, key, where), where, lens, cv2.IMREAD_GRAYSCALE)
-    return np.asarray(lens.straightened(image) > 127)
+    image = read_photograph(_file(folder, picture.more, key, picture.where), picture.lens, picture.where, cv2.IMREAD_GRAYSCALE)
+    return np.asarray(picture.lens.straightened(image) > 127)
 
 
 def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     name = frame.get(key)
     if not isinstance(name, str):
         raise InputError(DOING, f"{where}, {key}", repr(name), "name a file, relative to the folder")
-    return folder / name
+    path = folder / name
+    if not path.suffix and (folder / f"{name}.png").is_file():  # NeRF's own scenes leave the ending out
+        return folder / f"{name}.png"
+    return path
 
 
-def _read_image(path: Path, where: str, lens: _Lens, flag: int) -> U8:
+def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_COLOR) -> U8:
+    """Read a photograph as it is, BGR or grey, after checking that it is whole and what its lens says.
+
+    Raises:
+        InputError: The file is missing, cut off, of another size, too large, or not in grey or RGB.
+    """
     do = "check the path, which is relative to the folder, and the file"
     data = read_bytes(path, DOING, SOURCE_BYTES, do)
-    image = np.asarray(decode_image(data, f"{where}, {path}", DOING, do, flag), dtype=np.uint8)
-    height, width = image.shape[:2]
+    width, height = check_image(data, f"{where}, {path}", DOING, do)
     if (width, height) != (lens.width, lens.height):
         found = f"{width}x{height} pixels, the file says {lens.width}x{lens.height}"
         raise InputError(DOING, f"{where}, {path}", found, "give the photographs as they were")
-    return image
+    fault = picture_fault(data)
+    if fault:
+        raise InputError(DOING, f"{where}, {path}", fault, "give a whole PNG or JPEG in grey or RGB")
+    return np.asarray(decode_image(data, f"{where}, {path}", DOING, do, flag | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
 
 
 def _write_image(path: Path, image: U8) -> None:

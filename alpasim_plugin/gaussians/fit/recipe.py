@@ -35,6 +35,11 @@ class SplatRecipe:
         lr_colour: Rate of the constant colour; view-dependent coefficients get a twentieth.
         ssim_weight: Share of 1 - SSIM in the image loss, the rest is the mean absolute error.
         sky_weight: Weight of opacity where a view shows sky.
+        coarse_share: Share of the steps, at their beginning, that see views of half the width: a quarter of the work.
+        depth_weight: Weight of the difference between rendered depth and the views' depth, as a share of the latter; 0 does not look at it.
+        needle_weight: Weight of how much longer than ``needle_ratio`` times its middle axis a Gaussian is, by logarithm.
+        needle_ratio: See ``needle_weight``.
+        lr_exposure: Rate of the gain by which each view's colours differ from the model's; 0 leaves all at 1.
         densify_from: Share of the steps after which Gaussians are cloned and split.
         densify_until: Share of the steps until which they are.
         densify_every: Steps in between; 0 never densifies or prunes.
@@ -70,6 +75,11 @@ class SplatRecipe:
     lr_colour: float = 5e-3
     ssim_weight: float = 0.2
     sky_weight: float = 0.05
+    coarse_share: float = 0.0
+    depth_weight: float = 0.0
+    needle_weight: float = 0.0
+    needle_ratio: float = 6.0
+    lr_exposure: float = 0.0
     densify_from: float = 0.1
     densify_until: float = 0.6
     densify_every: int = 25
@@ -98,6 +108,14 @@ class SplatRecipe:
     def full(cls) -> SplatRecipe:
         """Return the recipe of a reconstruction as good as some minutes on two cores allow."""
         return cls(steps=1500)
+
+    @classmethod
+    def street(cls) -> SplatRecipe:
+        """Return the recipe of a recorded street: what three minutes of two cores allow (docs/experiments/real-fit.md)."""
+        return cls(
+            steps=1800, points=50_000, cap=80_000, start_size=0.8, coarse_share=0.5, depth_weight=0.05, needle_weight=0.02,
+            lr_exposure=1e-3, sky_weight=0.2,
+        )  # fmt: skip
 
     @classmethod
     def under_trained(cls, seed: int = 0) -> SplatRecipe:

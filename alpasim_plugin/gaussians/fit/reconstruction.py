@@ -46,11 +46,13 @@ class Reconstruction:
         background: World coordinates.
         actors: Actor id to Gaussians in its box frame; an actor that no view showed well enough is missing.
         sky: What stands behind everything; black where the views had no sky.
+        gains: Of the views that it was fitted to, in their order: red, green and blue of each over the model's; not written with it.
     """
 
     background: GaussianCloud
     actors: Mapping[str, GaussianCloud]
     sky: Sky
+    gains: tuple[tuple[float, float, float], ...] = ()
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -114,7 +116,7 @@ def _add(view: PosedView, total: F64, weight: F64) -> None:
     x, y, z = (local @ camera.T_camera_world[:3, :3]).T
     column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
     row = np.rint((HIGH_RAD - np.arctan2(z, np.hypot(x, y))) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))).astype(np.int64).clip(0, HEIGHT - 1)
-    np.add.at(total, (row, column), view.rgb[rows, columns] / 255.0)
+    np.add.at(total, (row, column), view.rgb[rows, columns] / (255.0 * np.array(view.gain)))
     np.add.at(weight, (row, column), 1.0)
 
 

@@ -95,6 +95,32 @@ def start_from_depth(
     return Start(cloud_from_points(*_joined(rest), size), actors)
 
 
+def start_from_maps(
+    views: Sequence[PosedView], more: Sequence[PosedView], count: int, scene_id: str, seed: int, size: float = 1.0
+) -> GaussianCloud:
+    """Draw ``count`` points, the same number from each view, from depth that was measured in photographs.
+
+    Args:
+        views: With depth where it was measured.
+        more: The same views with depth where it can only be guessed: one point in six comes from there.
+        count: Points in all.
+        scene_id, seed: Key of the sample.
+        size: See `cloud_from_points`.
+    """
+    parts = []
+    for i, (view, guess) in enumerate(zip(views, more, strict=True)):
+        rng = stream(scene_id, seed, "fit.start", i)
+        share = count // len(views)
+        parts += [_drawn(view, share - share // 6, rng), _drawn(guess, share // 6, rng)]
+    return cloud_from_points(*_joined(parts), size)
+
+
+def _drawn(view: PosedView, count: int, rng: np.random.Generator) -> _Points:
+    """Return measured points as they are, ``(n, 3)``, world, and the model's colours there."""
+    points, rgb = _sample(view, count, rng, noise=False)
+    return points, (rgb / np.array(view.gain)).clip(0, 1)
+
+
 def start_in_boxes(boxes: Mapping[str, Box], count: int, scene_id: str, seed: int) -> dict[str, GaussianCloud]:
     """Return ``count`` grey Gaussians spread over each actor's box, in its frame: a start where no depth says where its surface is."""
     clouds = {}
@@ -121,7 +147,7 @@ def cloud_from_points(points: F64, rgb: F64, size: float = 1.0) -> GaussianCloud
     return GaussianCloud(points, quats, np.repeat(sigma[:, None], 3, axis=1), np.full(n, START_OPACITY), dc_from_rgb(rgb)[:, None, :])
 
 
-def _sample(view: PosedView, count: int, rng: np.random.Generator) -> _Points:
+def _sample(view: PosedView, count: int, rng: np.random.Generator, noise: bool = True) -> _Points:
     """Return points in random order, ``(n, 3)``, world, and their colours ``(n, 3)``."""
     if view.depth is None:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -130,7 +156,8 @@ def _sample(view: PosedView, count: int, rng: np.random.Generator) -> _Points:
     pixels = pixels[rng.permutation(len(pixels))[:count]]
     rows, columns = np.divmod(pixels, view.camera.width)
     z = view.depth[rows, columns].astype(np.float64)
-    z += rng.standard_normal(len(z)) * (RANGE_ERROR_M + RANGE_ERROR_SHARE * z)
+    if noise:
+        z += rng.standard_normal(len(z)) * (RANGE_ERROR_M + RANGE_ERROR_SHARE * z)
     camera = view.camera
     local = np.stack([(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
     return transform_points(inverse(camera.T_camera_world), local), view.rgb[rows, columns] / 255.0

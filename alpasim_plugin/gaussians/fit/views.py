@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -26,8 +27,9 @@ class PosedView:
         name: For messages and file names.
         sky: ``(H, W)`` bool, where the image shows sky; None where that is unknown.
         mask: ``(H, W)`` bool, which pixels count (not the bonnet, say); None counts all.
-        depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; only the start cloud reads it.
+        depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; a start is drawn from it, and a fit may be held to it.
         actors: Actor id to ``T_world_box (4, 4)`` of the actors present.
+        gain: Of red, green and blue over the model's colours: the photograph's exposure and white balance.
 
     Raises:
         InputError: An array does not have the camera's size.
@@ -40,6 +42,7 @@ class PosedView:
     mask: Bool | None = None
     depth: F32 | None = None
     actors: Mapping[str, F64] = field(default_factory=dict)
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -101,6 +104,22 @@ def seen_from(camera: PinholeCamera, scene: SceneGraph, actors: Mapping[str, F64
     """Render one view with its sky and depth."""
     out = scene.render(camera, actors, threads)
     return PosedView(camera, out.to_uint8(), name, out.alpha <= 0.5, None, np.where(out.alpha > 0.5, out.depth, 0), dict(actors))
+
+
+def halved(view: PosedView) -> PosedView:
+    """Return a view of half the width and height; a pixel of it is sky, or counts, where all its four do, and its depth is the first's."""
+    camera = view.camera
+    h, w = camera.height // 2, camera.width // 2
+    K = camera.K.copy()
+    K[:2] /= 2
+    rgb = cv2.resize(view.rgb[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)
+
+    def all_four(flags: Bool | None) -> Bool | None:
+        return None if flags is None else flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3))
+
+    depth = None if view.depth is None else np.ascontiguousarray(view.depth[: 2 * h : 2, : 2 * w : 2])
+    small = PinholeCamera(w, h, K, camera.T_camera_world)
+    return PosedView(small, np.asarray(rgb, np.uint8), view.name, all_four(view.sky), all_four(view.mask), depth, view.actors, view.gain)
 
 
 def held_out(views: Sequence[PosedView], every: int) -> tuple[list[PosedView], list[PosedView]]:

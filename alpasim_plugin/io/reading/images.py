@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +28,37 @@ def image_size(data: bytes) -> tuple[int, int] | None:
         return struct.unpack(">II", data[16:24]) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if not data.startswith(b"\xff\xd8"):
         return None
+    frame = next((at for at in _segments(data) if data[at + 1] in _FRAMES), None)
+    if frame is None:
+        return None
+    height, width = struct.unpack(">HH", data[frame + 5 : frame + 9])
+    return width, height
+
+
+def picture_fault(data: bytes) -> str | None:
+    """Return what makes a picture of a good header useless as a photograph: cut off before its end, or printed colours; None if nothing.
+
+    Decoders fill the missing rest of a JPEG with grey, and turn CMYK into RGB by guess, without a word.
+    """
+    if data.startswith(PNG):
+        return None if b"IEND" in data[-16:] else "it ends before its last chunk: the file is cut off"
+    if b"\xff\xd9" not in data[-4096:]:  # some cameras write a few bytes after it
+        return "it ends without an end marker: the file is cut off"
+    at = next((i for i in _segments(data) if data[i + 1] in _FRAMES), None)
+    if at is not None and data[at + 9 : at + 10] == b"\x04":
+        return "four colour channels (CMYK)"
+    return None
+
+
+def _segments(data: bytes) -> Iterator[int]:
+    """Yield where the segments of a JPEG begin, up to the one that carries its size."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF or marker in _BARE:
-            at += 1 if marker == 0xFF else 2
-        elif marker in _FRAMES:
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None
+        yield at
+        if marker in _FRAMES:
+            return
+        at += 1 if marker == 0xFF else 2 if marker in _BARE else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
 
 
 def check_image(data: bytes, where: Path | str, doing: str, do_this: str = GIVE) -> tuple[int, int]:

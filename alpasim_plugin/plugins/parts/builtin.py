@@ -73,6 +73,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "argoverse": ("scenarios.sources:Argoverse", "Argoverse 2 log folder"),
         "commonroad": ("scenarios.sources:CommonRoad", "CommonRoad XML"),
         "cosmos": ("scenarios.sources:Cosmos", "Cosmos-Drive-Dreams clip folder"),
+        "drive": ("scenarios.sources:ImportedDrive", "folder that simrun import has written"),
         "usdz": ("scenarios.sources:Usdz", "AlpaSim scene"),
     },
 }

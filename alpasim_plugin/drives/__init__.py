@@ -1,0 +1,1 @@
+"""Recorded drives become scenarios: readers of posed photographs, ground, corridor, obstacles, quality."""

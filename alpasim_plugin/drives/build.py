@@ -1,0 +1,244 @@
+"""Import a drive: read it, place it, fit it, and write the folder that scenarios are loaded from. Read `import_drive` downwards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
+from alpasim_plugin.drives.correcting import with_corrected_poses
+from alpasim_plugin.drives.fitting import fitted
+from alpasim_plugin.drives.obstacles import standing_obstacles
+from alpasim_plugin.drives.opening import read_source
+from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
+from alpasim_plugin.drives.points import triangulated
+from alpasim_plugin.drives.quality import measure, write_page
+from alpasim_plugin.drives.road_points import road_points
+from alpasim_plugin.drives.source import DOING, Points, SourceDrive, checked
+from alpasim_plugin.gaussians.files.ply import write_points
+from alpasim_plugin.gaussians.fit.photographs import Picture, resized
+from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
+from alpasim_plugin.io.reading import read_bytes, read_json
+from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
+from scenarios.recorded import RecordedLog
+
+SCENARIO_FILE, KEY_FILE, FIT_FOLDER, POINTS_FILE = "scenario.yaml", "import.json", "fit", "points.ply"
+EVERY = 8  # one photograph of so many is held out
+FIT_PX = 608  # least width of fitted views; half of the photograph's where that is more
+RENDER_PX, SIDE_PX = 640, 16  # most width of the scenario's cameras; what their sides are multiples of, as fixers need
+SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
+Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A photograph of the drive in the scenario's world.
+
+    Attributes:
+        picture: As it was read.
+        camera: Its camera's name in the scenario.
+        use: ``fitted``, ``held-out`` or ``never-fitted``.
+        T_world_camera: ``(4, 4)``.
+        file: Where it lies in the imported folder.
+    """
+
+    picture: Picture
+    camera: str
+    use: str
+    T_world_camera: F64
+    file: str
+
+    def view(self) -> PosedView:
+        """Return it as a view of the width that is fitted."""
+        full = replace(self.picture, T_world_camera=self.T_world_camera).view()
+        width = max(min(full.camera.width, FIT_PX), -(-full.camera.width // 2))
+        small = resized(full, width + width % 2) if width < full.camera.width else full
+        return replace(small, name=f"{self.camera}-{self.picture.file.stem}")
+
+
+def import_drive(
+    folder: Path, out: Path, camera_height_m: float | None = None, lane_map: Path | None = None, report: Report | None = None
+) -> dict[str, Any]:
+    """Make a scenario of a recorded drive.
+
+    Args:
+        folder: The recording.
+        out: Becomes the scenario's folder, once everything is there; the same call goes on where an earlier one stopped.
+        camera_height_m: Of the front camera above the ground, for poses without a unit; None assumes one.
+        lane_map: OpenDRIVE map in the drive's coordinates; None makes a corridor of the driven path.
+        report: Called as the work goes on.
+
+    Returns:
+        What ``quality.json`` holds.
+
+    Raises:
+        InputError: Anything wrong with the recording, or ``out`` is something else; nothing is left behind then.
+        InfrastructureError: The disk refuses.
+    """
+    tell = report or (lambda stage, done, all: None)
+    drive = checked(read_source(folder), folder)
+    key = _key(drive, camera_height_m, lane_map)
+    if out.exists():
+        return _finished(out, key)
+    work = out.with_name(f".{out.name}.unfinished")
+    tell("correcting poses", 0, 1)
+    drive = with_corrected_poses(drive)
+    points = _points(drive, folder, tell)
+    placed = place(drive, points, camera_height_m)
+    shown = _shown(drive, placed)
+    _begin(work, key)
+    _write_photographs(work, shown, tell)
+    _write_points(work, placed)
+    views = {use: [one.view() for one in shown if one.use == use] for use in ("fitted", "held-out", "never-fitted")}
+    boxes = {actor.actor_id: actor.box for actor in placed.tracks}
+    scene_id = _scene_id(drive)
+    model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id, work / FIT_FOLDER, tell)
+    model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
+    roads = corridor(placed.ego, placed.ground)
+    obstacles = standing_obstacles(model.background, placed.ground, placed.ego)
+    log = _log(drive, placed, roads, scene_id)
+    _write_transforms(work, shown, exposures)
+    write_drive(work, log, placed.tracks, obstacles)
+    measured = measure(model, views, placed, obstacles, tell)
+    quality = write_page(work, drive, placed, measured)
+    write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, folder))
+    shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
+    work.replace(out)
+    return quality
+
+
+def _key(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
+    """Return what identifies an import: the pictures by size and time of change, their poses and lenses, and the options."""
+    digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and lane_map.read_bytes())).encode())
+    for one in drive.pictures:
+        status = one.file.stat()
+        digest.update(f"{one.file}{status.st_size}{status.st_mtime_ns}{one.camera}{one.t_us}".encode())
+        digest.update(one.T_world_camera.tobytes() + one.lens.K.tobytes() + one.lens.distortion.tobytes())
+    return digest.hexdigest()
+
+
+def _finished(out: Path, key: str) -> dict[str, Any]:
+    """Return the quality of a finished import, or refuse another thing in its place."""
+    if not (out / SCENARIO_FILE).is_file() or not (out / KEY_FILE).is_file():
+        raise InputError(DOING, str(out), "it exists and is no imported drive", "name a folder that does not exist yet")
+    if read_json(out / KEY_FILE, DOING).get("key") != key:
+        raise InputError(DOING, str(out), "it holds another import", "name another folder, or remove this one first")
+    quality: dict[str, Any] = read_json(out / "quality.json", DOING)
+    return quality
+
+
+def _begin(work: Path, key: str) -> None:
+    """Make the working folder, or keep that of the same import; another one's is removed."""
+    if work.exists() and (not (work / KEY_FILE).is_file() or json.loads((work / KEY_FILE).read_text()).get("key") != key):
+        shutil.rmtree(work)
+    work.mkdir(parents=True, exist_ok=True)
+    write_json(work / KEY_FILE, {"key": key})
+
+
+def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
+    """Return the drive's points, in its frame: given, or triangulated; and the road's own, which features miss."""
+    front = drive.of(drive.front)
+    if drive.points is not None:
+        return drive.points
+    tell("following points", 0, 1)
+    points = triangulated(front, str(folder))
+    tell("measuring the road", 0, 1)
+    rough = place(drive, points)
+    if rough.strip is None:
+        return points
+    T = rough.T_world_source
+    return points.joined(road_points(front, rough.poses[drive.front], rough.strip).moved(np.linalg.inv(T)))
+
+
+def _shown(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
+    """Return all photographs with their names, uses and places."""
+    first_us = int(placed.ego.t_us[0])
+    out = []
+    for camera in drive.cameras:
+        name = camera if camera != drive.front or "front" in camera else "front"
+        for i, one in enumerate(drive.of(camera)):
+            held = i % EVERY == EVERY // 2 and len(drive.of(camera)) >= EVERY
+            use = "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
+            ending = one.file.suffix.lower() if not one.lens.bends else ".png"
+            picture = replace(one, t_us=int(one.t_us or 0) - first_us)
+            out.append(Shown(picture, name, use, placed.poses[camera][i], f"photographs/{name}/{i:06d}{ending}"))
+    return out
+
+
+def _write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
+    """Write the photographs without distortion; those that have none are copied as they are."""
+    for i, one in enumerate(shown):
+        path = work / one.file
+        tell("writing photographs", i + 1, len(shown))
+        if path.is_file():
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        bends = one.picture.lens.bends
+        data = cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes() if bends else read_bytes(one.picture.file, DOING)
+        write_bytes(path, data, DOING)
+
+
+def _write_points(work: Path, placed: PlacedDrive) -> None:
+    write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
+
+
+def _write_transforms(work: Path, shown: Sequence[Shown], exposures: Mapping[str, tuple[float, float, float]]) -> None:
+    frames = []
+    for one in shown:
+        lens, K = one.picture.lens, one.picture.lens.straight_K()
+        frame = {
+            "file_path": one.file, "transform_matrix": one.T_world_camera.tolist(), "w": lens.width, "h": lens.height,
+            "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "t_us": one.picture.t_us, "camera": one.camera, "use": one.use,
+        }  # fmt: skip
+        name = f"{one.camera}-{one.picture.file.stem}"
+        frames.append(frame | ({"exposure": list(exposures[name])} if name in exposures else {}))
+    write_json(work / TRANSFORMS_FILE, {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames})
+
+
+def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str) -> RecordedLog:
+    first_us = int(placed.ego.t_us[0])
+    ego = replace(placed.ego, t_us=placed.ego.t_us - first_us)
+    origin = placed.T_world_source[:3, 3]
+    cameras = [_camera(drive, placed, name) for name in drive.cameras if name not in drive.never_fitted and name in placed.mounts]
+    return RecordedLog(
+        scene_id, "drive", roads, placed.ground, ego, Vehicle(), (), tuple(cameras), (-origin[0], -origin[1], -origin[2]), "",
+        notes=(*drive.notes, *placed.notes),
+    )  # fmt: skip
+
+
+def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
+    """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the middle."""
+    picture = drive.of(name)[0]
+    lens = picture.lens
+    width = min(RENDER_PX, lens.width) // SIDE_PX * SIDE_PX
+    scale = width / lens.width
+    height = max(SIDE_PX, int(lens.height * scale) // SIDE_PX * SIDE_PX)
+    K = np.diag([scale, scale, 1.0]) @ lens.straight_K()
+    K[1, 2] -= (lens.height * scale - height) / 2
+    return CameraSpec(name if name != drive.front or "front" in name else "front", width, height, K, placed.mounts[name])
+
+
+def _scene_id(drive: SourceDrive) -> str:
+    letters = "".join(c if c.isalnum() or c in "_.-" else "-" for c in drive.scene_id).strip("-_.")
+    return letters[:80] or "drive"
+
+
+def _scenario_text(scene_id: str, log: RecordedLog, folder: Path) -> str:
+    length_us = int(log.ego_log.t_us[-1])
+    timing = ""
+    if length_us < SHORT_US:
+        timing = "timing: {start_us: 0, warmup_us: 0}  # a short recording: driven from its first pose on\n"
+    return (
+        f"# A recorded drive, imported from {folder.resolve().name}; quality.md says how good it is.\n"
+        f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
+    )

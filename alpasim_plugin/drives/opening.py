@@ -1,0 +1,93 @@
+"""From a folder or file to the drive in it: which of the known forms it has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.dgp import is_dgp, read_dgp
+from alpasim_plugin.drives.kitti import is_kitti, read_kitti
+from alpasim_plugin.drives.points import agreeing
+from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
+from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
+from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.io.reading import read_json_object
+
+PERIOD_US = 100_000  # between photographs without times
+PAIRS, FEWEST, CLEARLY = 6, 40, 1.5  # pairs that the axes are tried on; matches that tell; by how much one must be better
+FORMS = "transforms.json, a KITTI odometry folder, a DGP scene, a COLMAP model, a video, or a folder of photographs"
+
+
+def read_source(folder: Path) -> SourceDrive:
+    """Read a recorded drive.
+
+    Raises:
+        InputError: There is nothing, no reader knows it, or it is damaged.
+    """
+    if not folder.exists():
+        raise InputError(DOING, str(folder), "it does not exist", f"give {FORMS}")
+    if folder.is_dir() and (folder / FILE).is_file():
+        return _transforms(folder)
+    if folder.is_dir() and is_kitti(folder):
+        return read_kitti(folder)
+    if folder.is_dir() and is_dgp(folder):
+        return read_dgp(folder)
+    inside = ", ".join(sorted(path.name for path in folder.iterdir())[:5]) if folder.is_dir() else "a file"
+    raise InputError(DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
+
+
+def _transforms(folder: Path) -> SourceDrive:
+    """Read a ``transforms.json`` of either convention of axes."""
+    document = read_json_object(folder / FILE, DOING)
+    notes = []
+    if "axes" in document:
+        axes = str(document["axes"])
+    else:
+        axes, note = recognised_axes(folder)
+        notes.append(note)
+    _, listed = read_pictures(folder, axes)
+    there, missing = present(folder, listed)
+    if missing:
+        notes.append(f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {', '.join(missing[:4])}...")
+    names = list(dict.fromkeys(one.camera or "front" for one in there))
+    front = next((name for name in names if "front" in name), names[0])
+    pictures: list[Picture] = []
+    for name in names:
+        mine = [replace(one, camera=name) for one in there if (one.camera or "front") == name]
+        if all(one.t_us is None for one in mine):
+            mine.sort(key=lambda one: one.file.name)
+            notes.append(f"no times: photographs of {name} are taken by name, {1_000_000 // PERIOD_US} a second")
+        elif any(one.t_us is None for one in mine):
+            bad = next(one for one in mine if one.t_us is None)
+            raise InputError(DOING, bad.where, "no t_us, which other photographs have", "give every photograph its time, or none")
+        pictures += sorted(timed(mine, PERIOD_US), key=lambda one: int(one.t_us or 0))
+    kept = tuple(sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"}))
+    metric = "the file's word that its unit is the metre" if document.get("unit") == "m" else None
+    points = document.get("ply_file_path")
+    cloud = None if points is None else read_points(folder / str(points))
+    given = None if cloud is None else Points(cloud.means, np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1), np.zeros((len(cloud), 3, 3)))
+    return SourceDrive("transforms", folder.resolve().name, tuple(pictures), front, kept, metric, points=given, notes=tuple(notes))
+
+
+def recognised_axes(folder: Path) -> tuple[str, str]:
+    """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs fit together, and a note.
+
+    With the wrong one epipolar lines are mirrored, or points lie behind the cameras.
+
+    Raises:
+        InputError: Both fit, or neither.
+    """
+    _, listed = read_pictures(folder, "opencv")
+    there = sorted(present(folder, listed)[0], key=lambda one: one.file.name)
+    chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
+    counts = np.sum([agreeing(there[i], there[i + 1], list(AXES.values())) for i in chosen], axis=0)
+    inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))
+    best, other = sorted(inliers, key=lambda axes: -inliers[axes])
+    if inliers[best] < FEWEST or inliers[best] < CLEARLY * inliers[other]:
+        found = f"no 'axes', and photographs fit together alike with {best} ({inliers[best]} matches) and {other} ({inliers[other]})"
+        do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file'
+        raise InputError(DOING, str(folder / FILE), found, do)
+    return best, f"axes recognised as {best}: {inliers[best]} matches of neighbouring photographs fit, {inliers[other]} with {other}"

@@ -1,0 +1,244 @@
+"""Put a drive into the scenario's world: up, scale, ground, the rig's path and mounts, and a corridor where there is no map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alpasim_plugin.core.geometry import arc_lengths, inverse, matrix_from_quat, se3, trajectory_from_poses
+from alpasim_plugin.core.types import F64, Actor, HeightField, Lane, LaneMap, Trajectory
+from alpasim_plugin.drives.ground import GroundStrip, fit_ground
+from alpasim_plugin.drives.source import Points, SourceDrive
+from alpasim_plugin.world.ground import from_points, height_at
+
+CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
+AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car
+LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = 3.5, 8.0, 15.0, 1.0  # of the corridor: width, how far it goes on, distance of vertices
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedDrive:
+    """A drive in the scenario's world.
+
+    Attributes:
+        T_world_source: ``(4, 4)`` from the files' frame; scales.
+        points: In the world.
+        ground: Height field.
+        strip: The fit behind it; None where the ground was not seen.
+        ego: Rig poses.
+        mounts: Camera to its pose on the rig.
+        poses: Camera to its poses ``(N, 4, 4)``, in the order of the drive's pictures.
+        tracks: Road users.
+        facts: How up, scale and ground were found, for the page of quality.
+        notes: What was assumed.
+    """
+
+    T_world_source: F64
+    points: Points
+    ground: HeightField
+    strip: GroundStrip | None
+    ego: Trajectory
+    mounts: Mapping[str, F64]
+    poses: Mapping[str, F64]
+    tracks: tuple[Actor, ...]
+    facts: Mapping[str, object]
+    notes: tuple[str, ...]
+
+
+def place(drive: SourceDrive, points: Points, camera_height_m: float | None = None) -> PlacedDrive:
+    """Find up, scale and ground of a drive, and put everything into the world.
+
+    Args:
+        drive: As its files say it.
+        points: In the drive's frame.
+        camera_height_m: Of the front camera above the ground; None: as the poses say, or assumed where they have no unit.
+    """
+    T, strip, found_up = _levelled(drive, points)
+    scale, scale_note = _scale(drive, strip, camera_height_m)
+    T = np.diag([scale, scale, scale, 1.0]) @ T
+    moved = points.moved(T)
+    poses = {name: np.array([_moved(T, one.T_world_camera) for one in drive.of(name)]) for name in drive.cameras}
+    strip = fit_ground(moved, poses[drive.front][:, :3, 3])
+    height = camera_height_m or CAMERA_HEIGHT_M
+    field = strip.field() if strip else _below(poses[drive.front][:, :3, 3], height)
+    shift = np.eye(4)
+    first = poses[drive.front][0, :3, 3]
+    shift[:3, 3] = -first[0], -first[1], -float(height_at(field, first[None])[0])
+    T, moved = shift @ T, moved.moved(shift)
+    poses = {name: shift @ values for name, values in poses.items()}
+    field = HeightField(field.x0_m + shift[0, 3], field.y0_m + shift[1, 3], field.cell_m, field.z + shift[2, 3])
+    strip = fit_ground(moved, poses[drive.front][:, :3, 3]) if strip else None
+    ego, mounts, mount_notes = _rig(drive, T, poses, field)
+    notes = [found_up, scale_note, *mount_notes]
+    if strip is None:
+        notes.append(f"the ground below the path was not seen: it is taken {height:g} m below the camera")
+    return PlacedDrive(
+        T, moved, field, strip, ego, mounts, poses, tuple(_moved_actor(T, one) for one in drive.tracks),
+        {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)}, tuple(notes),
+    )  # fmt: skip
+
+
+def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | None, str]:
+    """Return the transform that puts the drive's up along z (and, without a given up, its first heading along x), and the ground found."""
+    front = np.array([one.T_world_camera for one in drive.of(drive.front)])
+    given = drive.up is not None
+    up = np.asarray(drive.up, dtype=np.float64) if drive.up is not None else -front[:, :3, 1].mean(axis=0)
+    T = _upright(up, None if given else front)
+    strip = None
+    for _ in range(1 if given else 3):
+        strip = fit_ground(points.moved(T), front[:, :3, 3] @ T[:3, :3].T + T[:3, 3])
+        if strip is None or given:
+            break
+        T = _upright(_normal(strip) @ T[:3, :3], front)
+    if given:
+        return T, strip, "up as the files say it"
+    if strip is None:
+        return T, None, "up from the camera, which is taken to stand upright on the mean"
+    return T, strip, "up from the ground: the road's mean plane is taken as level"
+
+
+def _upright(up: F64, front: F64 | None) -> F64:
+    """Return a rotation ``(4, 4)`` that puts ``up`` along z; the first heading of cameras ``(N, 4, 4)`` along x, or the least turn."""
+    z = up / np.linalg.norm(up)
+    forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    if front is not None:
+        forward = front[min(len(front) - 1, 3), :3, 3] - front[0, :3, 3]
+        if np.linalg.norm(np.cross(z, forward)) < 1e-9 or float(forward @ front[0, :3, 2]) < 0:
+            forward = front[0, :3, 2]
+    x = forward - z * float(forward @ z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    return T
+
+
+def _normal(strip: GroundStrip) -> F64:
+    """Return the unit normal of the plane nearest to a strip under the path itself."""
+    own = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
+    line, along = strip.frame.line[own], strip.frame.along[own]
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
+    A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
+    slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    return np.asarray(normal / np.linalg.norm(normal))
+
+
+def _scale(drive: SourceDrive, strip: GroundStrip | None, camera_height_m: float | None) -> tuple[float, str]:
+    if drive.metric is not None:
+        return 1.0, f"scale from {drive.metric}"
+    wanted = camera_height_m or CAMERA_HEIGHT_M
+    how = "as given" if camera_height_m else "assumed; give --camera-height if you know it"
+    if strip is not None:
+        return wanted / strip.height, f"scale from the camera's height above the ground, {wanted:g} m ({how})"
+    reach = float(np.linalg.norm(drive.path - drive.path.mean(axis=0), axis=1).max())
+    return 4.0 / reach, "scale unknown: neither poses in metres nor a ground below the camera; the path reaches 4 m from its middle"
+
+
+def _moved(T: F64, T_world_camera: F64) -> F64:
+    """Return a rigid pose under a transform that may scale."""
+    out = T @ T_world_camera
+    out[:3, :3] /= np.cbrt(np.linalg.det(out[:3, :3]))
+    return np.asarray(out)
+
+
+def _moved_actor(T: F64, actor: Actor) -> Actor:
+    track = actor.track
+    poses = np.array([_moved(T, pose) for pose in _matrices(track)])
+    return replace(actor, track=trajectory_from_poses(track.t_us, poses))
+
+
+def _matrices(track: Trajectory) -> F64:
+    return np.array([se3(xyz, quat) for xyz, quat in zip(track.xyz, track.quat, strict=True)])
+
+
+def _below(path: F64, height: float) -> HeightField:
+    """Return the ground at a height below a path that saw none: the path's own heights, nearest first."""
+    corners = np.array([[dx, dy, 0.0] for dx in (-60.0, 60.0) for dy in (-60.0, 60.0)])
+    around = np.concatenate([path, path[:1] + corners, path[-1:] + corners])
+    around[:, 2] -= height
+    return from_points(around, 2.0)
+
+
+def _rig(drive: SourceDrive, T: F64, poses: Mapping[str, F64], field: HeightField) -> tuple[Trajectory, dict[str, F64], list[str]]:
+    """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
+    if drive.ego is not None and drive.mounts is not None:
+        rig = np.array([_moved(T, pose) for pose in _matrices(drive.ego)])
+        above = float(np.median(rig[:, 2, 3] - height_at(field, rig[:, :3, 3])))
+        lower = np.eye(4)
+        lower[2, 3] = -above
+        mounts = {name: inverse(lower) @ mount for name, mount in drive.mounts.items() if name in poses}
+        note = f"the rig's origin lies {above:.2f} m above the ground that was found, and was put on it"
+        return trajectory_from_poses(drive.ego.t_us, rig @ lower), mounts, [note]
+    front, pictures = poses[drive.front], drive.of(drive.front)
+    mount = _front_mount(front, field)
+    ego = trajectory_from_poses(np.array([int(one.t_us or 0) for one in pictures]), np.array([pose @ inverse(mount) for pose in front]))
+    times = {one.t_us: i for i, one in enumerate(pictures)}
+    mounts = {drive.front: mount}
+    for name in drive.cameras[1:]:
+        common = [(times[one.t_us], i) for i, one in enumerate(drive.of(name)) if one.t_us in times]
+        if common:
+            i, j = common[len(common) // 2]
+            mounts[name] = mount @ inverse(front[i]) @ poses[name][j]
+    return ego, mounts, [f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"]
+
+
+def _front_mount(front: F64, field: HeightField) -> F64:
+    """Return the front camera's pose on the rig: its mean direction against the road and the way it moves, its median height."""
+    centres = front[:, :3, 3]
+    step = np.gradient(centres, axis=0)
+    moving = np.linalg.norm(step[:, :2], axis=1) > 0.3 * np.median(np.linalg.norm(step[:, :2], axis=1))
+    turns = []
+    for pose, along in zip(front[moving], step[moving], strict=True):
+        heading = along[:2] / np.linalg.norm(along[:2])
+        if heading @ pose[:2, 2] < 0:  # it looks back, or the drive goes backwards: the camera's own direction counts
+            heading = pose[:2, 2] / max(float(np.linalg.norm(pose[:2, 2])), 1e-9)
+        ahead = float(height_at(field, (pose[:2, 3] + heading)[None])[0] - height_at(field, (pose[:2, 3] - heading)[None])[0]) / 2
+        x = np.array([*heading, ahead]) / np.sqrt(1 + ahead**2)
+        y = np.cross([0.0, 0.0, 1.0], x)
+        y /= np.linalg.norm(y)
+        turns.append(np.stack([x, y, np.cross(x, y)]) @ pose[:3, :3])
+    u, _, vt = np.linalg.svd(np.median(turns, axis=0))
+    mount = np.eye(4)
+    mount[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mount[:3, 3] = AHEAD_OF_AXLE_M, 0.0, float(np.median(centres[:, 2] - height_at(field, centres)))
+    return mount
+
+
+def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:
+    if strip is None:
+        return None
+    errors = np.abs(strip.section_errors)
+    worst, usual = (round(float(value), 4) for value in (errors.max(), np.median(errors))) if len(errors) else (None, None)
+    return {
+        "points": strip.used, "camera_height_m": round(strip.height, 3), "sections": len(errors), "median_error_m": usual,
+        "worst_error_m": worst,
+    }  # fmt: skip
+
+
+def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
+    """Return the driven path as one lane of usual width, without paint: nothing says where lines were."""
+    xy = ego.xyz[:, :2]
+    keep = [0]
+    for i in range(1, len(xy)):
+        if np.linalg.norm(xy[i] - xy[keep[-1]]) > 0.5:
+            keep.append(i)
+    line = xy[keep] if len(keep) > 1 else np.stack([xy[0], xy[0] + _heading(ego)])
+    first, last = line[1] - line[0], line[-1] - line[-2]
+    line = np.concatenate([
+        [line[0] - first / np.linalg.norm(first) * BEFORE_M], line, [line[-1] + last / np.linalg.norm(last) * BEYOND_M]
+    ])  # fmt: skip
+    s = arc_lengths(line)
+    at = np.linspace(0.0, s[-1], max(2, int(s[-1] / VERTEX_M) + 1))
+    centre = np.stack([np.interp(at, s, line[:, axis]) for axis in range(2)], axis=1)
+    along = np.gradient(centre, axis=0)
+    left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    edges = [centre + side * LANE_M / 2 * left for side in (0.0, 1.0, -1.0)]
+    middle, one, other = (np.column_stack([edge, height_at(field, edge)]) for edge in edges)
+    return LaneMap({"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")})
+
+
+def _heading(ego: Trajectory) -> F64:
+    return np.asarray(matrix_from_quat(ego.quat[0])[:2, 0])

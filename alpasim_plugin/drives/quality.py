@@ -1,0 +1,158 @@
+"""How good an imported drive is: photographs that the fit did not see, coverage on and beside the path, ground, what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.drives.placing import PlacedDrive
+from alpasim_plugin.drives.source import SourceDrive
+from alpasim_plugin.gaussians.fit.quality import Comparison, compare
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
+from scenarios.drive import Obstacle
+
+ASIDE_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
+OPAQUE = 0.5
+SHOWN, COVERED = 6, 8  # photographs of the page; views that coverage is measured on
+PLAN_PX, PLAN_M = 900, 70.0  # the view from above: its width, and how much of the world it shows at most across
+PICTURES = "pictures"
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What was measured.
+
+    Attributes:
+        rows: Use of the photographs to their comparisons.
+        coverage: Metres beside the path to the share of the lower half of the picture that the model covers.
+        plan: ``(H, W, 3)`` uint8, the drive from above.
+        obstacles: Standing obstacles; None where they were not looked for.
+    """
+
+    rows: Mapping[str, Sequence[Comparison]]
+    coverage: Mapping[float, float]
+    plan: U8
+    obstacles: Sequence[Obstacle] | None
+
+
+def measure(
+    model: Reconstruction, views: Mapping[str, Sequence[PosedView]], placed: PlacedDrive, obstacles: Sequence[Obstacle] | None, tell: Report
+) -> Measured:
+    """Render the model where photographs were taken that it did not see, and beside the path."""
+    graph = model.graph()
+    rows = {}
+    for use in ("held-out", "never-fitted"):
+        chosen = [views[use][i] for i in _spread(len(views[use]), 12)]
+        if chosen:
+            tell(f"measuring {use} photographs", 0, 1)
+            rows[use] = compare(graph, chosen)
+    some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
+    coverage = {aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M}
+    return Measured(rows, coverage, _plan(placed, obstacles), obstacles)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())] if count else []
+
+
+def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
+    """Return the share of the picture's lower half that the model covers, seen from beside where a view was taken."""
+    shift = np.eye(4)
+    pose = inverse(view.camera.T_camera_world)
+    shift[:3, 3] = -aside_m * pose[:3, 0]  # the camera's own left
+    camera = type(view.camera).from_pose(view.camera.width, view.camera.height, view.camera.K, shift @ pose)
+    alpha = graph.render(camera, {}).alpha
+    return float((alpha[camera.height // 2 :] > OPAQUE).mean())
+
+
+def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle] | None) -> U8:
+    """Draw points, path and obstacles from above, the drive's heading to the right."""
+    path = placed.ego.xyz[:, :2]
+    low, high = path.min(axis=0) - 15.0, path.max(axis=0) + 15.0
+    high = np.maximum(high, low + 20.0)
+    metres = float(min(max(high - low), 10 * PLAN_M))
+    scale = PLAN_PX / metres
+    size = np.ceil((high - low).clip(0, metres) * scale).astype(int)
+    image = np.full((size[1], size[0], 3), 255, np.uint8)
+
+    def at(xy: F64) -> F64:
+        return np.column_stack([(xy[:, 0] - low[0]) * scale, (high[1] - xy[:, 1]) * scale])
+
+    order = np.argsort(placed.points.xyz[:, 2])
+    cells = at(placed.points.xyz[order]).astype(np.int64)
+    inside = ((cells >= 0) & (cells < size)).all(axis=1)
+    image[cells[inside, 1], cells[inside, 0]] = np.rint(placed.points.rgb[order][inside] * 200).astype(np.uint8)
+    cv2.polylines(image, [np.rint(at(path)).astype(np.int32)], False, (30, 90, 220), 2, cv2.LINE_AA)
+    for one in obstacles or ():
+        c, s, half = np.cos(one.yaw_rad), np.sin(one.yaw_rad), np.array([one.box.length_m, one.box.width_m]) / 2
+        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half @ np.array([[c, s], [-s, c]]) + one.xyz[:2]
+        cv2.polylines(image, [np.rint(at(corners)).astype(np.int32)], True, (200, 40, 30), 2, cv2.LINE_AA)
+    return image
+
+
+def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: Measured) -> dict[str, Any]:
+    """Write ``quality.json``, ``quality.md`` and the pictures, and return what ``quality.json`` holds."""
+    (folder / PICTURES).mkdir(exist_ok=True)
+    shown = []
+    for use, rows in measured.rows.items():
+        for row in [rows[i] for i in _spread(len(rows), SHOWN // 2)]:
+            name = f"{PICTURES}/{use}-{row.name}.jpg"
+            _write(folder / name, np.concatenate([row.truth, row.shown], axis=0))
+            shown.append((use, row, name))
+    _write(folder / PICTURES / "plan.png", measured.plan)
+    quality = {
+        "source": drive.kind,
+        "photographs": {use: len(rows) for use, rows in measured.rows.items()},
+        **{use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")} for use, rows in measured.rows.items()},
+        "coverage": [{"aside_m": aside, "share": round(share, 4)} for aside, share in measured.coverage.items()],
+        "obstacles": None if measured.obstacles is None else len(measured.obstacles),
+        **placed.facts,
+        "notes": [*drive.notes, *placed.notes],
+    }
+    write_json(folder / "quality.json", quality)
+    write_text(folder / "quality.md", _page(drive, quality, shown))
+    return quality
+
+
+def _mean(rows: Sequence[Comparison], name: str) -> float:
+    return round(float(np.mean([getattr(row, name) for row in rows])), 3)
+
+
+def _write(path: Path, rgb: U8) -> None:
+    write_bytes(path, cv2.imencode(path.suffix, np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes())
+
+
+def _page(drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[str, Comparison, str]]) -> str:
+    lines = [f"# Quality of {drive.scene_id}", "", "## What is missing or assumed", ""]
+    lines += [f"- {note}" for note in quality["notes"]]
+    lines += ["", "## Photographs that the fit never saw", "", "| photographs | number | PSNR, dB | SSIM |", "|---|---|---|---|"]
+    for use, count in quality["photographs"].items():
+        lines.append(f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |")
+    lines += ["", "## Coverage of the lower half of the picture", "", "| metres to the left of the path | covered |", "|---|---|"]
+    lines += [f"| {row['aside_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]]
+    ground = quality["ground"]
+    if ground:
+        errors = (
+            f"median {100 * ground['median_error_m']:.1f} cm, worst {100 * ground['worst_error_m']:.1f} cm" if ground["sections"] else "-"
+        )
+        lines += [
+            "",
+            f"Ground: {ground['points']} points, camera {ground['camera_height_m']:.2f} m above it; against them by section: {errors}.",
+        ]
+    number = quality["obstacles"]
+    lines += ["", "Standing obstacles: " + ("not looked for; contact with them is not measured." if number is None else f"{number}.")]
+    lines += ["", "## From above", "", f"![from above]({PICTURES}/plan.png)", "", "## Photograph above, reconstruction below"]
+    for use, row, name in shown:
+        lines += ["", f"{use}, {row.name}: {row.psnr_db:.2f} dB", "", f"![{row.name}]({name})"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,152 @@
+"""What a reader of a recorded drive returns, in the frame and the unit of its own files, and the checks that all of them pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, Actor, Trajectory
+from alpasim_plugin.gaussians.fit.photographs import Picture
+
+DOING = "importing a drive"
+JUMP = 12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
+STANDING = 0.02  # a drive shorter than this share of what it looks at shows nothing from two sides
+LEAST_M = 1.0
+FEWEST = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of surfaces.
+
+    Attributes:
+        xyz: ``(N, 3)``.
+        rgb: ``(N, 3)`` 0..1.
+        covariance: ``(N, 3, 3)`` of a point's place, same unit as ``xyz``, squared.
+    """
+
+    xyz: F64
+    rgb: F64
+    covariance: F64
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.xyz)
+
+    def moved(self, T: F64) -> Points:
+        """Return them in another frame; ``(4, 4)``, may scale."""
+        return Points(self.xyz @ T[:3, :3].T + T[:3, 3], self.rgb, T[:3, :3] @ self.covariance @ T[:3, :3].T)
+
+    def chosen(self, which: F64) -> Points:
+        """Return those that a mask or indices choose."""
+        return Points(self.xyz[which], self.rgb[which], self.covariance[which])
+
+    def joined(self, other: Points) -> Points:
+        """Return these and others of the same frame."""
+        mine, theirs = (self.xyz, self.rgb, self.covariance), (other.xyz, other.rgb, other.covariance)
+        return Points(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
+
+    @property
+    def rise_spread(self) -> F64:
+        """Return the standard deviation of the third coordinate, ``(N,)``."""
+        return np.asarray(np.sqrt(np.maximum(self.covariance[:, 2, 2], 0.0)))
+
+    @property
+    def spread(self) -> F64:
+        """Return the standard deviation of the place, all directions together, ``(N,)``."""
+        return np.asarray(np.sqrt(np.maximum(np.trace(self.covariance, axis1=1, axis2=2), 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class SourceDrive:
+    """A recorded drive as its files say it.
+
+    Attributes:
+        kind: Of the files: ``kitti``, ``transforms``, ``dgp``, ``colmap`` or ``sfm``.
+        scene_id: A name for the scenario.
+        pictures: All photographs, camera by camera in order of time; each has its time and camera.
+        front: The camera that looks ahead and is driven by.
+        never_fitted: Cameras whose photographs are kept for judging.
+        metric: What makes lengths metres; None where the unit is arbitrary.
+        up: ``(3,)`` against gravity; None where the files do not say it.
+        points: Of LiDAR or of structure from motion; None where there are none.
+        ego: Rig poses, where the files have them.
+        mounts: Camera to its pose on the rig ``(4, 4)``, where the files have them; belongs to ``ego``.
+        tracks: Recorded road users.
+        notes: What was assumed or left out.
+    """
+
+    kind: str
+    scene_id: str
+    pictures: tuple[Picture, ...]
+    front: str
+    never_fitted: tuple[str, ...] = ()
+    metric: str | None = None
+    up: F64 | None = None
+    points: Points | None = None
+    ego: Trajectory | None = None
+    mounts: dict[str, F64] | None = None
+    tracks: tuple[Actor, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def of(self, camera: str) -> list[Picture]:
+        """Return a camera's pictures in order of time."""
+        return [picture for picture in self.pictures if picture.camera == camera]
+
+    @property
+    def cameras(self) -> list[str]:
+        """Return the cameras, the front one first."""
+        names = dict.fromkeys(str(picture.camera) for picture in self.pictures)
+        return sorted(names, key=lambda name: (name != self.front, name in self.never_fitted, list(names).index(name)))
+
+    @property
+    def path(self) -> F64:
+        """Return where the front camera was, ``(N, 3)``."""
+        return np.array([picture.T_world_camera[:3, 3] for picture in self.of(self.front)])
+
+
+def checked(drive: SourceDrive, folder: Path) -> SourceDrive:
+    """Return a drive whose poses can be those of a moving camera.
+
+    Raises:
+        InputError: Too few photographs, two lengths of unit in one file, a camera that stands or only turns.
+    """
+    pictures = drive.of(drive.front)
+    if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
+        found = f"{len(pictures)} photographs of the camera {drive.front!r}"
+        raise InputError(DOING, str(folder), found, f"give at least {FEWEST} photographs with poses along a drive")
+    steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    length = float(steps.sum())
+    if length == 0 or (drive.metric and length < LEAST_M and len(pictures) >= FEWEST):
+        found = f"the camera {drive.front!r} moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns"
+        raise InputError(DOING, str(folder), found, "give a part of the drive in which the car moves: depth comes from moving")
+    far = int(np.argmax(steps))
+    if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
+        one = pictures[far + 1]
+        found = f"a step of {steps[far]:.4g} to {one.file.name}, where the usual step is {usual:.4g}"
+        raise InputError(DOING, one.where, found, "give all poses in one unit, metres, and one drive at a time")
+    ratio = _unit_change(steps)
+    if ratio is not None:
+        one = pictures[ratio[0]]
+        found = f"steps {ratio[1]:.0f} times as long from {one.file.name} on as before it: metres and centimetres mixed?"
+        raise InputError(DOING, one.where, found, "give all poses in one unit, metres")
+    return drive
+
+
+def _unit_change(steps: F64) -> tuple[int, float] | None:
+    """Return where steps become, at once and for good, more than 30 times longer or shorter, and the factor; None where they do not."""
+    for at in range(3, len(steps) - 3):
+        before, after = float(np.median(steps[max(0, at - 5) : at])), float(np.median(steps[at : at + 5]))
+        if min(before, after) > 0 and max(before / after, after / before) > 30:
+            return at + 1, max(before / after, after / before)
+    return None
+
+
+def timed(pictures: Sequence[Picture], period_us: int) -> tuple[Picture, ...]:
+    """Return pictures without times as taken one after another."""
+    return tuple(replace(one, t_us=i * period_us) if one.t_us is None else one for i, one in enumerate(pictures))

@@ -1,0 +1,175 @@
+"""Measure how far away most pixels of photographs along a way are: optical flow to neighbours, triangulated with the known poses.
+
+A neighbour is first warped by the depth that tracks give (inverse depth is linear in the picture on every plane, so it is interpolated
+linearly between the tracks' points); flow (dense inverse search, Kroeger et al. 2016) then finds the little that is left, also where the
+road under the bonnet moves by a hundred pixels. The inverse depth of a pixel is the one that explains all neighbours best (Gauss-Newton,
+Huber weights); it is kept where neighbours agree and the parallax is large enough to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy
+
+from alpasim_plugin.core.types import F32, F64, Bool
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks
+from alpasim_plugin.gaussians.fit.views import PosedView
+
+GAPS = (-3, -2, -1, 1, 2, 3)
+STRIDE = 2  # every such pixel is measured, in rows and columns
+RESIDUAL_PX = 0.7  # between flow and what the depth predicts
+LEAST_SUPPORT = 3  # neighbours that agree; two at the ends of the way
+NOISE_PX, LARGEST_SPREAD = 0.25, 0.10  # of flow; of a depth, as a share of it
+NEAR_M, FAR_M = 0.5, 300.0
+ROUNDS = 3
+FEWEST_POINTS = 12  # that tracks must place in a view
+AGREE = 0.06  # share by which the depths of two views may differ
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """What one photograph's pixels are known of; pixels between those that are measured are 0 as unknown ones are.
+
+    Attributes:
+        depth: ``(H, W)`` metres along the optical axis; 0 where unknown.
+        spread: ``(H, W)`` its standard deviation as a share of it; 0 where unknown.
+    """
+
+    depth: F32
+    spread: F32
+
+
+def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> list[DepthMap]:
+    """Return the depth of every view; nothing is known of a view in which tracks place too few points.
+
+    Args:
+        views: In the order of the way, of one size.
+        tracks: Over the same views.
+        placed: Their points.
+    """
+    greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # type: ignore[attr-defined]
+    flow.setFinestScale(1)
+    out = []
+    for i, view in enumerate(views):
+        guess = between_points(view.camera, tracks, placed, i)
+        near = [i + gap for gap in GAPS if 0 <= i + gap < len(views) and views[i + gap].camera.width == view.camera.width]
+        if guess is None or len(near) < 2:
+            out.append(DepthMap(*(np.zeros(view.rgb.shape[:2], np.float32) for _ in range(2))))
+            continue
+        seen = [_Seen.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow) for j in near]
+        out.append(_depth(view, seen, guess))
+    return [_agreed(views, out, i) for i in range(len(views))]
+
+
+def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int) -> F32 | None:
+    """Return inverse depth ``(H, W)`` interpolated between the points that view i shows; None where there are too few."""
+    rows = np.flatnonzero(tracks.view == i)
+    local = placed.xyz[tracks.point[rows]] @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    good = (placed.error_px[rows] < 1.5) & (local > NEAR_M)
+    if good.sum() < FEWEST_POINTS:
+        return None
+    at, q = tracks.at[rows][good], 1 / local[good]
+    v, u = np.mgrid[0 : camera.height : 4, 0 : camera.width : 4] + 0.5
+    inside = scipy.interpolate.LinearNDInterpolator(at, q)(u, v)
+    outside = scipy.interpolate.NearestNDInterpolator(at, q)(u, v)
+    coarse = np.where(np.isnan(inside), outside, inside).astype(np.float32)
+    return np.asarray(cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """One neighbour: where it sees each measured pixel, and the terms of ``pi(a + q b)``, where depth 1/q projects to."""
+
+    a: F32  # (h, w, 3)
+    b: F32  # (3,)
+    at: F32  # (h, w, 2) pixels
+    ok: Bool  # (h, w)
+
+    @classmethod
+    def by_flow(cls, camera: PinholeCamera, other: PinholeCamera, grey: F32, there: F32, guess: F32, flow: cv2.DISOpticalFlow) -> _Seen:
+        """Warp the neighbour by the guess, find the rest by flow."""
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32) + np.float32(0.5)
+        T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
+        H, b = (other.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32), (other.K @ T[:3, 3]).astype(np.float32)
+        a = u[..., None] * H[:, 0] + v[..., None] * H[:, 1] + H[:, 2]
+        p = a + guess[..., None] * b
+        at = p[..., :2] / np.maximum(p[..., 2:], 1e-3)
+        warped = cv2.remap(there, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        rest = flow.calc(grey, warped, None)
+        x, y = (u - 0.5 + rest[..., 0])[::STRIDE, ::STRIDE], (v - 0.5 + rest[..., 1])[::STRIDE, ::STRIDE]
+        at = cv2.remap(at, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        h, w = there.shape[:2]
+        ok = (at[..., 0] >= 0) & (at[..., 1] >= 0) & (at[..., 0] <= w) & (at[..., 1] <= h) & (p[::STRIDE, ::STRIDE, 2] > 0.1)
+        return cls(a[::STRIDE, ::STRIDE], b, at, np.asarray(ok))
+
+    def error(self, q: F32) -> tuple[F32, F32]:
+        """Return projection minus flow ``(h, w, 2)`` and its derivative by q."""
+        p = self.a + q[..., None] * self.b
+        z = np.maximum(p[..., 2:], 1e-3)
+        uv = p[..., :2] / z
+        return uv - self.at, (self.b[:2] - uv * self.b[2]) / z
+
+
+def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> DepthMap:
+    """Find each measured pixel's inverse depth from where the neighbours see it, and judge it."""
+    q = guess[::STRIDE, ::STRIDE].copy()
+    for _ in range(ROUNDS):
+        H, g = np.full(q.shape, 1e-9, np.float32), np.zeros_like(q)
+        for other in seen:
+            e, J = other.error(q)
+            weight = other.ok / np.maximum(np.linalg.norm(e, axis=2), 0.5)
+            H += weight * (J * J).sum(axis=2)
+            g += weight * (J * e).sum(axis=2)
+        q = np.clip(q - g / H, 0.0, 1 / NEAR_M).astype(np.float32)
+    support, information = np.zeros(q.shape, np.int32), np.zeros_like(q)
+    for other in seen:
+        e, J = other.error(q)
+        good = other.ok & (np.linalg.norm(e, axis=2) < RESIDUAL_PX)
+        support += good
+        information += good * (J * J).sum(axis=2)
+    sigma = NOISE_PX / np.sqrt(np.maximum(information, 1e-12))  # of the inverse depth
+    known = (support >= min(LEAST_SUPPORT, len(seen) - 1)) & (q > 1 / FAR_M) & (sigma < LARGEST_SPREAD * q)
+    if view.mask is not None:
+        known &= view.mask[::STRIDE, ::STRIDE]
+    depth, spread = np.zeros(view.rgb.shape[:2], np.float32), np.zeros(view.rgb.shape[:2], np.float32)
+    depth[::STRIDE, ::STRIDE] = np.where(known, 1 / np.maximum(q, 1e-6), 0)
+    spread[::STRIDE, ::STRIDE] = np.where(known, sigma / np.maximum(q, 1e-6), 0)
+    return DepthMap(depth, spread)
+
+
+def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> DepthMap:
+    """Keep what the depth map of a neighbour confirms, within `AGREE` and both spreads, or none can look at."""
+    depth, spread = maps[i].depth, maps[i].spread
+    rows, columns = np.nonzero(depth)
+    camera = views[i].camera
+    z = depth[rows, columns].astype(np.float64)
+    local = np.stack([(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+    confirmed, asked = np.zeros(len(z), bool), np.zeros(len(z), bool)
+    for gap in GAPS:
+        if 0 <= i + gap < len(views):
+            ok, looked = _confirms(views[i + gap].camera, maps[i + gap].depth, local, camera)
+            confirmed |= ok
+            asked |= looked
+    keep = np.zeros(depth.shape, bool)
+    keep[rows, columns] = confirmed | ~asked
+    return DepthMap(np.where(keep, depth, 0), np.where(keep, spread, 0))
+
+
+def _confirms(other: PinholeCamera, depth: F32, local: F64, camera: PinholeCamera) -> tuple[Bool, Bool]:
+    """Return which points ``(N, 3)`` of a camera another one's depth map confirms, and which it knows anything of."""
+    T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
+    p = local @ T[:3, :3].T + T[:3, 3]
+    z = np.maximum(p[:, 2], 1e-3)
+    x = np.floor((p[:, 0] / z * other.fx + other.cx) / STRIDE).astype(np.int64)
+    y = np.floor((p[:, 1] / z * other.fy + other.cy) / STRIDE).astype(np.int64)
+    small = depth[::STRIDE, ::STRIDE]
+    inside = (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])
+    found = np.zeros(len(z))
+    found[inside] = small[y[inside], x[inside]]
+    return np.asarray((found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2])), np.asarray(found > 0)

@@ -1,0 +1,171 @@
+"""Follow points through photographs that were taken one after the other, and place them: what structure from motion calls tracks.
+
+Corners (Shi and Tomasi 1994) are followed from photograph to photograph by pyramidal Lucas-Kanade and kept where following them back ends
+where they began. A track of several photographs fixes a point far better than a match of two, and its reprojection errors say how far the
+poses can be trusted; `alpasim_plugin.gaussians.fit.adjust` corrects them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.types import F64, I64, U8, Bool
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.fit.views import PosedView
+
+CORNERS, APART_PX, QUALITY = 1500, 7, 0.003  # of a photograph: most corners, their distance, and their least strength
+BACK_PX = 0.4  # following a point there and back may end so far from where it began
+WINDOW = (15, 15)
+ROUNDS, HUBER_PX = 8, 1.0  # of placing a point: Gauss-Newton steps, and the error from which one counts less
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Points that several photographs show.
+
+    Attributes:
+        view: ``(M,)`` which photograph each observation is of.
+        point: ``(M,)`` which point it shows, 0..P-1, ascending.
+        at: ``(M, 2)`` where, pixels of that photograph; the first pixel's centre is at (0.5, 0.5).
+        count: P.
+    """
+
+    view: I64
+    point: I64
+    at: F64
+    count: int
+
+    def only(self, keep: Bool) -> Tracks:
+        """Return the observations ``(M,)`` that are kept; points that fewer than two of them show are left out."""
+        view, point, at = self.view[keep], self.point[keep], self.at[keep]
+        times = np.bincount(point, minlength=self.count)
+        stay = times[point] >= 2
+        ids, number = np.unique(point[stay], return_inverse=True)
+        return Tracks(view[stay], number.astype(np.int64), at[stay], len(ids))
+
+
+def follow(views: Sequence[PosedView]) -> Tracks:
+    """Follow corners from each photograph to the next; tracks of two observations and more, masked pixels left out."""
+    greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
+    rows: list[tuple[I64, I64, F64]] = []
+    points, ids, count = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
+    for i, grey in enumerate(greys):
+        fresh = _corners(np.asarray(grey, np.uint8), points, views[i].mask)
+        points = np.concatenate([points, fresh])
+        ids = np.concatenate([ids, count + np.arange(len(fresh))])
+        count += len(fresh)
+        rows.append((np.full(len(ids), i, dtype=np.int64), ids, points.astype(np.float64) + 0.5))
+        if i + 1 < len(views) and len(points):
+            points, kept = _followed(np.asarray(grey, np.uint8), np.asarray(greys[i + 1], np.uint8), points)
+            points, ids = points[kept], ids[kept]
+    view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
+    order = np.argsort(point, kind="stable")
+    all_ = Tracks(view[order], point[order], at[order], count)
+    return all_.only(np.ones(len(order), dtype=bool))
+
+
+def _corners(
+    grey: U8, taken: np.ndarray[tuple[int, ...], np.dtype[np.float32]], mask: Bool | None
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
+    for x, y in np.rint(taken).astype(int):
+        cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
+    found = cv2.goodFeaturesToTrack(grey, max(CORNERS - len(taken), 1), QUALITY, APART_PX, mask=free)
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+
+
+def _followed(
+    a: U8, b: U8, points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float32]], Bool]:
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points[:, None], None, winSize=WINDOW, maxLevel=4)  # type: ignore[call-overload]
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=WINDOW, maxLevel=4)
+    off = np.linalg.norm(back[:, 0] - points, axis=1)
+    moved = there[:, 0]
+    inside = (moved[:, 0] >= 0) & (moved[:, 1] >= 0) & (moved[:, 0] <= a.shape[1] - 1) & (moved[:, 1] <= a.shape[0] - 1)
+    return moved, np.asarray((ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where the points of tracks lie.
+
+    Attributes:
+        xyz: ``(P, 3)`` metres, world.
+        error_px: ``(M,)`` distance of each observation from the point's projection; infinite behind the camera.
+        angle_rad: ``(P,)`` between the outermost rays to the point: small means that its distance is not known.
+    """
+
+    xyz: F64
+    error_px: F64
+    angle_rad: F64
+
+
+def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
+    """Triangulate every point: nearest to its rays at first, then by robust reprojection error (Gauss-Newton, Huber weights)."""
+    R, t, K = pose_arrays(cameras)
+    centre = -np.einsum("nji,nj->ni", R, t)
+    local = np.einsum("nij,nj->ni", np.linalg.inv(K)[tracks.view], np.c_[tracks.at, np.ones(len(tracks.at))])
+    ray = np.einsum("nji,nj->ni", R[tracks.view], local)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None]
+    A, b = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
+    np.add.at(A, tracks.point, across)
+    np.add.at(b, tracks.point, np.einsum("nij,nj->ni", across, centre[tracks.view]))
+    xyz = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
+    for _ in range(ROUNDS):
+        e, J, _ = residuals(xyz, tracks, R, t, K)
+        w = huber(e)
+        JT = J.transpose(0, 2, 1) * w[:, None, None]
+        H, g = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
+        np.add.at(H, tracks.point, JT @ J)
+        np.add.at(g, tracks.point, (JT @ e[..., None])[..., 0])
+        step = np.linalg.solve(H + 1e-9 * np.eye(3) * (1 + np.trace(H, axis1=1, axis2=2)[:, None, None]), g[..., None])[..., 0]
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        away = np.linalg.norm(xyz - centre.mean(axis=0), axis=1, keepdims=True)
+        xyz = xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12))
+    e, _, z = residuals(xyz, tracks, R, t, K)
+    error = np.where(z > 1e-3, np.linalg.norm(e, axis=1), np.inf)
+    return Placed(xyz, error, _angles(xyz, tracks, centre))
+
+
+def pose_arrays(cameras: Sequence[PinholeCamera]) -> tuple[F64, F64, F64]:
+    """Return rotations ``(V, 3, 3)`` and shifts ``(V, 3)`` world to camera, and intrinsics ``(V, 3, 3)``."""
+    T = np.array([camera.T_camera_world for camera in cameras])
+    return T[:, :3, :3], T[:, :3, 3], np.array([camera.K for camera in cameras])
+
+
+def residuals(xyz: F64, tracks: Tracks, R: F64, t: F64, K: F64) -> tuple[F64, F64, F64]:
+    """Return projection minus observation ``(M, 2)`` in pixels, its derivative by the point ``(M, 2, 3)``, and the depth ``(M,)``."""
+    local = np.einsum("nij,nj->ni", R[tracks.view], xyz[tracks.point]) + t[tracks.view]
+    z = local[:, 2]
+    safe = np.where(np.abs(z) < 1e-6, 1e-6, z)
+    f = np.stack([K[tracks.view, 0, 0], K[tracks.view, 1, 1]], axis=1)
+    c = np.stack([K[tracks.view, 0, 2], K[tracks.view, 1, 2]], axis=1)
+    by_local = projection_slope(local, safe, f)
+    return f * local[:, :2] / safe[:, None] + c - tracks.at, by_local @ R[tracks.view], z
+
+
+def projection_slope(local: F64, z: F64, f: F64) -> F64:
+    """Return the derivative ``(M, 2, 3)`` of pixels by camera coordinates ``(M, 3)``; ``z (M,)`` their safe depth, ``f (M, 2)`` pixels."""
+    J = np.zeros((len(local), 2, 3))
+    J[:, 0, 0], J[:, 1, 1] = f[:, 0] / z, f[:, 1] / z
+    J[:, :, 2] = -f * local[:, :2] / (z**2)[:, None]
+    return J
+
+
+def huber(e: F64) -> F64:
+    """Return the weights ``(M,)`` of errors ``(M, 2)``: 1 up to `HUBER_PX`, then falling as the error grows."""
+    return np.asarray(HUBER_PX / np.maximum(np.linalg.norm(e, axis=1), HUBER_PX))
+
+
+def _angles(xyz: F64, tracks: Tracks, centre: F64) -> F64:
+    """Return the angle between the first and the last ray of each point ``(P,)``, radians."""
+    first = np.searchsorted(tracks.point, np.arange(tracks.count))
+    last = np.searchsorted(tracks.point, np.arange(tracks.count), side="right") - 1
+    a, b = (xyz - centre[tracks.view[i]] for i in (first, last))
+    cross = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.asarray(np.arctan2(cross, np.einsum("ij,ij->i", a, b)))

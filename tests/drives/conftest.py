@@ -1,0 +1,37 @@
+"""A street of known shape, imported once; the fit is replaced by Gaussians at the points, which takes no time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.drives import build
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import cloud_from_points
+from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
+from tests.drives.street import write_kitti
+
+
+def at_once(views: Any, kept: Any, points: Any, *rest: Any) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
+    """Stand in for `fitting.fitted`."""
+    cloud = cloud_from_points(points.xyz, points.rgb)
+    return Reconstruction(cloud, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))), {views[0].name: (1.1, 1.0, 0.9)}
+
+
+@pytest.fixture
+def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the fit out."""
+    monkeypatch.setattr(build, "fitted", at_once)
+
+
+@pytest.fixture(scope="session")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return an imported KITTI-like drive: 24 photographs with poses and one without, a right camera."""
+    folder = tmp_path_factory.mktemp("drive")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "fitted", at_once)
+        build.import_drive(write_kitti(folder / "street", spare_pictures=1), folder / "out")
+    return folder / "out"

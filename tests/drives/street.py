@@ -1,0 +1,137 @@
+"""A street of known shape, photographed: a bowed road between two walls, with a box beside the path, drawn by casting rays."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+WIDTH, HEIGHT, FOCAL = 320, 128, 180.0
+CAMERA_M, STEP_M, COUNT = 1.5, 0.6, 24
+WALL_M, BOX_LOW, BOX_HIGH = 5.0, np.array([14.0, 2.0, 0.0]), np.array([18.0, 3.8, 1.4])
+K = np.array([[FOCAL, 0.0, WIDTH / 2 + 3], [0.0, FOCAL, HEIGHT / 2 - 10], [0.0, 0.0, 1.0]])
+RIG_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Street:
+    """What the photographs show.
+
+    Attributes:
+        bow_m: How far the road rises in its middle over 30 m.
+    """
+
+    bow_m: float = 0.3
+
+    def ground(self, x: np.ndarray) -> np.ndarray:
+        """Return the road's height at stations."""
+        return self.bow_m * np.sin(np.pi * np.clip(x, -10, 40) / 30)
+
+    def pose(self, x: float, aside: float = 0.0) -> np.ndarray:
+        """Return ``T_world_camera`` at a station; the world is x along, y left, z up."""
+        T = np.eye(4)
+        slope = float(self.ground(np.array(x + 0.5)) - self.ground(np.array(x - 0.5)))
+        c, s = np.cos(np.arctan(slope)), np.sin(np.arctan(slope))
+        T[:3, :3] = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ RIG_FROM_CAMERA
+        T[:3, 3] = x, -aside, float(self.ground(np.array(x))) + CAMERA_M
+        return T
+
+    def photograph(self, T: np.ndarray, bend: np.ndarray | None = None, fisheye: bool = False) -> np.ndarray:
+        """Return what a camera at a pose sees, ``(H, W, 3)`` uint8 BGR; with a lens that bends lines where coefficients are given."""
+        v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
+        pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
+        middle = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        if bend is None:
+            rays = (pixels[:, 0] - middle[:2, 2]) / FOCAL
+        else:
+            rays = (cv2.fisheye if fisheye else cv2).undistortPoints(pixels, middle, bend)[:, 0]
+        direction = np.column_stack([rays, np.ones(len(rays))]) @ T[:3, :3].T
+        return self._colours(T[:3, 3], direction).reshape(HEIGHT, WIDTH, 3)
+
+    def _colours(self, at: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        far = 1e6
+        t = np.where(ray[:, 2] < -1e-3, -CAMERA_M / np.minimum(ray[:, 2], -1e-3), far)
+        for _ in range(8):  # the bowed road is met where the ray is as high as it
+            x = at[0] + np.clip(t, 0, 200) * ray[:, 0]
+            t = np.where(ray[:, 2] < -1e-3, (self.ground(x) - at[2]) / np.minimum(ray[:, 2], -1e-3), far)
+        best, kind = np.where(t > 0, t, far), np.zeros(len(ray), dtype=int)
+        for side in (1.0, -1.0):
+            t = np.where(ray[:, 1] * side > 1e-6, (side * WALL_M - at[1]) / np.where(np.abs(ray[:, 1]) > 1e-6, ray[:, 1], 1), far)
+            z = at[2] + t * ray[:, 2]
+            hit = (t > 0) & (t < best) & (z < 6.0)
+            best, kind = np.where(hit, t, best), np.where(hit, 1, kind)
+        lift = np.array([0, 0, float(self.ground(np.array(16.0)))])
+        low, high = BOX_LOW + lift, BOX_HIGH + lift
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (low - at) / ray, (high - at) / ray
+        t0, t1 = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+        hit = (t0 < t1) & (t0 > 0) & (t0 < best)
+        best, kind = np.where(hit, t0, best), np.where(hit, 2, kind)
+        place = at + np.minimum(best, 1e3)[:, None] * ray
+        grey = 0.55 * noise(place, 0.25) + 0.45 * noise(place + 7.0, 0.06)
+        grey = np.where(best > 60, 0.8, grey)
+        tint = np.array([[0.5, 0.5, 0.5], [0.4, 0.55, 0.8], [0.8, 0.4, 0.3]])[kind]
+        sky = np.array([0.95, 0.9, 0.85])
+        colour = np.where((best >= 1e5)[:, None], sky, tint * (0.4 + 1.1 * grey[:, None]))
+        return np.rint(255 * colour.clip(0, 1)).astype(np.uint8)
+
+
+def noise(place: np.ndarray, cell_m: float) -> np.ndarray:
+    """Return smooth noise 0..1 at places ``(N, 3)``: values at the corners of cells, interpolated."""
+    q = place / cell_m
+    base = np.floor(q).astype(np.int64)
+    f = q - base
+    f = f * f * (3 - 2 * f)
+    total = np.zeros(len(place))
+    for corner in range(8):
+        offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
+        weight = np.prod(np.where(offset == 1, f, 1 - f), axis=1)
+        i = (base + offset).astype(np.uint64)
+        h = i[:, 0] * np.uint64(0x9E3779B97F4A7C15) + i[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F) + i[:, 2] * np.uint64(0x165667B19E3779F9)
+        h ^= h >> np.uint64(29)
+        h *= np.uint64(0xBF58476D1CE4E5B9)
+        h ^= h >> np.uint64(32)
+        total += weight * (h & np.uint64(0xFFFF)).astype(np.float64) / 0xFFFF
+    return total
+
+
+def stations() -> np.ndarray:
+    """Return where the photographs are taken."""
+    return np.arange(COUNT) * STEP_M
+
+
+def write_transforms(folder: Path, axes: str = "opencv", say_axes: bool = True, street: Street | None = None, **keys: object) -> Path:
+    """Write the street as ``transforms.json``; keys of the document are added."""
+    chosen = street or Street()
+    (folder / "images").mkdir(parents=True)
+    turn = np.eye(4) if axes == "opencv" else np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = []
+    for i, x in enumerate(stations()):
+        name = f"images/{i:03d}.png"
+        cv2.imwrite(str(folder / name), chosen.photograph(chosen.pose(x)))
+        frames.append({"file_path": name, "transform_matrix": (chosen.pose(x) @ turn).tolist()})
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": K[0, 2], "cy": K[1, 2]}
+    document = {**lens, **({"axes": axes} if say_axes else {}), "frames": frames, **keys}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+def write_kitti(folder: Path, street: Street | None = None, spare_pictures: int = 0, stereo: bool = True) -> Path:
+    """Write the street as a KITTI odometry folder; ``spare_pictures`` have no pose."""
+    chosen = street or Street()
+    base = 0.54
+    for name, aside in (("image_l", 0.0), ("image_r", base))[: 2 if stereo else 1]:
+        (folder / name).mkdir(parents=True)
+        for i, x in enumerate(np.arange(COUNT + spare_pictures) * STEP_M):
+            cv2.imwrite(str(folder / name / f"{i:06d}.png"), cv2.cvtColor(chosen.photograph(chosen.pose(x, aside)), cv2.COLOR_BGR2GRAY))
+    first = np.linalg.inv(chosen.pose(0.0))
+    poses = [first @ chosen.pose(x) for x in stations()]
+    (folder / "poses.txt").write_text("\n".join(" ".join(f"{v:.9e}" for v in pose[:3].ravel()) for pose in poses) + "\n")
+    P = np.column_stack([K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), np.zeros(3)])
+    right = P.copy()
+    right[0, 3] = -FOCAL * base
+    (folder / "calib.txt").write_text("\n".join(" ".join(f"{v:.12e}" for v in one.ravel()) for one in (P, right)))
+    return folder

@@ -1,0 +1,104 @@
+"""A recording becomes a folder that drives: what stands in it, how it is loaded, and that nothing is left half-written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives import build
+from alpasim_plugin.drives.build import import_drive
+from alpasim_plugin.gaussians.fit.photographs import read_views
+from alpasim_plugin.world.ground import height_at
+from scenarios.load import load_scenario
+from tests.drives.street import COUNT, STEP_M, Street, write_kitti, write_transforms
+
+
+def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(imported: Path) -> None:
+    scenario = load_scenario(imported / "scenario.yaml")
+    assert scenario.source == "drive"
+    assert scenario.model == str(imported / "model")
+    uses = [(one.camera, one.use) for one in scenario.recording]
+    assert (uses.count(("front", "fitted")), uses.count(("front", "held-out"))) == (COUNT - 3, 3)
+    assert uses.count(("right", "never-fitted")) == COUNT
+    assert all(Path(one.path).is_file() for one in scenario.recording)
+    assert scenario.recording[0].exposure == (1.1, 1.0, 0.9)
+    (lane,) = scenario.lane_map.lanes.values()
+    assert (lane.left_paint, lane.right_paint) == ("none", "none")
+    assert scenario.cameras[0].name == "front"
+    assert (scenario.cameras[0].width % 16, scenario.cameras[0].height % 16) == (0, 0)
+    assert any("the last was dropped (000024.png)" in note for note in scenario.notes)
+
+
+def test_the_wheels_stand_on_the_road_that_bows(imported: Path) -> None:
+    scenario = load_scenario(imported / "scenario.yaml")
+    street, x = Street(), np.arange(4.0, 16.0)
+    found = height_at(scenario.ground, np.column_stack([x, np.zeros(len(x))]))
+    true = street.ground(x)
+    slope = np.polyfit(x, found - true, 1)  # up is the road's own: its mean slope and height are not known
+    assert np.abs(found - true - np.polyval(slope, x)).max() < 0.05
+    ego = scenario.ego_log.xyz
+    assert np.abs(ego[:, 2] - height_at(scenario.ground, ego)).max() < 0.05
+    assert np.linalg.norm(np.diff(ego, axis=0), axis=1) == pytest.approx(STEP_M, abs=0.02)
+
+
+def test_the_photographs_are_read_by_the_one_reader(imported: Path) -> None:
+    views, points = read_views(imported)
+    assert len(views) == 2 * COUNT
+    assert points is not None
+    first = next(one for one in load_scenario(imported / "scenario.yaml").recording)
+    assert np.allclose(views[0].camera.K, first.K)
+
+
+def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imported: Path, tmp_path: Path) -> None:
+    source = imported.parent / "street"
+    assert import_drive(source, imported) == json.loads((imported / "quality.json").read_text())
+    with pytest.raises(InputError, match="another import"):
+        import_drive(source, imported, camera_height_m=1.2)
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(InputError, match="no imported drive"):
+        import_drive(source, tmp_path / "mine")
+
+
+def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_fit: None) -> None:
+    source, real = write_kitti(tmp_path / "street", stereo=False), build.measure
+
+    def stop(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "measure", stop)
+    with pytest.raises(KeyboardInterrupt):
+        import_drive(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(build, "measure", real)
+    import_drive(source, tmp_path / "out")
+    assert not (tmp_path / ".out.unfinished").exists()
+    assert load_scenario(tmp_path / "out/scenario.yaml").model
+
+
+def test_scale_without_metres_comes_from_the_cameras_height(tmp_path: Path, quick_fit: None) -> None:
+    folder = write_transforms(tmp_path / "walk")
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame in document["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 0.37
+    (folder / "transforms.json").write_text(json.dumps(document))
+    quality = import_drive(folder, tmp_path / "out", camera_height_m=1.5)
+    assert quality["scale"] == "scale from the camera's height above the ground, 1.5 m (as given)"
+    ego = load_scenario(tmp_path / "out/scenario.yaml").ego_log.xyz
+    assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.03)
+
+
+def test_the_command_tells_what_it_found(tmp_path: Path, quick_fit: None, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_transforms(tmp_path / "walk", axes="opengl", say_axes=False, unit="m")
+    command = ["import", "drive", str(folder), "--out", str(tmp_path / "out"), "--camera-height", "1.5", "--json"]
+    assert run_command(command) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["scenario"] == str(tmp_path / "out/scenario.yaml")
+    assert any("axes recognised as opengl" in note for note in told["notes"])
+    assert told["held-out"]["psnr_db"] > 5
+    assert "## What is missing or assumed" in (tmp_path / "out/quality.md").read_text()
