@@ -13,7 +13,7 @@ from alpasim_plugin.cli.options import Json, Run
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.plugins.parts import resolve, resolve_renderer
+from alpasim_plugin.plugins.parts import resolve, resolve_renderer, split_names
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.schema import PROBE_JSON, slug
 from alpasim_plugin.runtime.fork import Change, fork_rollout
@@ -82,7 +82,7 @@ def probe(
     as_json: Json = False,
 ) -> None:
     """Query the policy at a logged rollout's poses behind several renderers and measure the distance between its plans."""
-    names = tuple(name.strip() for name in renderers.split(",") if name.strip())
+    names = tuple(split_names(renderers))
     _check_names(names, None)
     use_run(run, warn)
     past = find_rollout(run, cell, scenario)

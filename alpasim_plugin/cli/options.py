@@ -63,7 +63,9 @@ class What:
     @property
     def renderers(self) -> list[str]:
         """Give the names of the renderers."""
-        return [name.strip() for name in self.renderer.split(",") if name.strip()]
+        from alpasim_plugin.plugins.parts import split_names
+
+        return split_names(self.renderer)
 
     @property
     def of_fixer(self) -> tuple[str, ...]:

@@ -152,3 +152,23 @@ def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(monk
     whole = spec.code_digest
     monkeypatch.setattr(spec, "code_digest", lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""))
     assert resolve("policy", "policies:ConstantVelocity").digest != digest
+
+
+def test_settings_in_brackets_make_another_arm_of_one_fixer() -> None:
+    plain, without = resolve_renderer("identity"), resolve_renderer("identity[references=0,tolerance_m=0.5]+clean")
+    assert (without.name, str(without)) == ("identity[references=0,tolerance_m=0.5]+clean", "identity[references=0,tolerance_m=0.5]+clean")
+    assert without.fixer is not None
+    assert plain.fixer is not None
+    assert without.fixer.settings.tolerance_m == 0.5  # type: ignore[union-attr]
+    assert without.fixer.digest != plain.fixer.digest
+
+
+def test_a_bracket_counts_for_its_own_arm_and_over_what_is_set_for_all() -> None:
+    own = resolve_renderer("identity[tolerance_m=0.5]", ["tolerance_m=0.25", "tolerance_deg=0.75"])
+    assert (own.fixer.settings.tolerance_m, own.fixer.settings.tolerance_deg) == (0.5, 0.75)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", ["clean[references=0]", "identity[]", "identity[references]", "identity[references=0", "identity[a=1][b=2]"])
+def test_brackets_without_settings_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match="bracket"):
+        resolve_renderer(name)

@@ -22,7 +22,7 @@ from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
 from alpasim_plugin.lab.video_metrics.table import markdown
-from alpasim_plugin.plugins.parts import resolve
+from alpasim_plugin.plugins.parts import resolve, split_names, split_settings
 
 EPILOG = """
 Examples:
@@ -113,8 +113,10 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         else:
             common.append(given)
     variants: dict[str, Variant] = {}
-    for part in (p.strip() for p in text.split(",") if p.strip()):
+    for part in split_names(text):
         label, equals, named = part.partition("=")
+        if "[" in label:  # settings in brackets, not a label
+            label, equals = part, ""
         fixer = named if equals else label
         if label in variants or label == TRUTH or "/" in label:
             found = f"label {label!r} is taken, or no name of a folder"
@@ -122,7 +124,9 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         if fixer in (RAW, NEAREST):
             variants[label] = Variant(label)
             continue
+        fixer, given = split_settings(fixer)
         name, settings = bundle_fixer(fixer) if fixer.endswith(".safetensors") else (fixer, ())
+        settings = (*settings, *given)
         variants[label] = Variant(label, resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
     if own or not variants:
         raise InputError(

@@ -5,7 +5,17 @@ A name is resolved once, into a `PartSpec` that carries the part's identity; a w
 """
 
 from alpasim_plugin.plugins.parts.build import build, complete
-from alpasim_plugin.plugins.parts.resolve import RendererSpec, find, names, overrides_of, resolve, resolve_renderer, unidentified
+from alpasim_plugin.plugins.parts.resolve import (
+    RendererSpec,
+    find,
+    names,
+    overrides_of,
+    resolve,
+    resolve_renderer,
+    split_names,
+    split_settings,
+    unidentified,
+)
 from alpasim_plugin.plugins.parts.spec import PartSpec, digest
 
 __all__ = [
@@ -19,5 +29,7 @@ __all__ = [
     "overrides_of",
     "resolve",
     "resolve_renderer",
+    "split_names",
+    "split_settings",
     "unidentified",
 ]

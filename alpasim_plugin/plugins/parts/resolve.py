@@ -132,27 +132,62 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
 
 
 def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
-    """Resolve ``RENDERER``, ``FIXER`` (over `BASE`) or ``FIXER+RENDERER``; ``@STEPS`` after either belongs to the fixer.
+    """Resolve ``RENDERER``, ``FIXER`` (over `BASE`) or ``FIXER+RENDERER``; ``@STEPS`` and ``[KEY=VALUE,...]`` belong to the fixer.
 
     Args:
-        name: Renderer and fixer as `resolve` takes them: ``clean``, ``onefixer@2``, ``onefixer+my.module:MyRenderer``.
+        name: Renderer and fixer as `resolve` takes them: ``clean``, ``onefixer@2``, ``onefixer[references=0]``,
+            ``onefixer+my.module:MyRenderer``.
         overrides: ``KEY=VALUE`` of the fixer's settings, ignored where there is none; ``RENDERER:KEY=VALUE`` counts for the renderer of
             that name alone.
 
     Raises:
         InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one without the weights that it needs.
     """
-    overrides = overrides_of(name, overrides)
-    front, plus, base = name.partition("+")
+    plain, own = split_settings(name)
+    overrides = (*overrides_of(name, overrides), *own)
+    front, plus, base = plain.partition("+")
     if not plus:
+        if own and front in entries("renderer"):
+            do = "leave the brackets out, or name a fixer: onefixer[references=0]"
+            raise InputError(DOING, f"renderer {name!r}", f"{front!r} is no fixer: it has no settings for brackets", do)
         if front in entries("renderer") or "://" in front or (is_target(front) and not _is_fixer(front)):
             return RendererSpec(name, resolve("renderer", front))
         base = BASE
     else:
         front, base = _steps_to_front(front, base)
     if not is_target(front):
-        _require_fixer(name, front, bool(plus))
-    return RendererSpec(name, resolve("renderer", base), _in_the_loop(resolve("fixer", front, overrides)))
+        _require_fixer(plain, front, bool(plus))
+    fixer = _in_the_loop(resolve("fixer", front, overrides))
+    return RendererSpec(name, resolve("renderer", base), replace(fixer, name=f"{fixer.name}[{','.join(own)}]") if own else fixer)
+
+
+def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
+    """Split the settings in brackets off a name.
+
+    Raises:
+        InputError: Brackets without ``KEY=VALUE`` in them, or more than one pair.
+
+    Example:
+        >>> split_settings("onefixer[references=0,precision=fp32]+clean")
+        ('onefixer+clean', ('references=0', 'precision=fp32'))
+    """
+    if "[" not in name:
+        return name, ()
+    match = re.fullmatch(r"([^\[\]]+)\[([^\[\]]+)\]([^\[\]]*)", name)
+    settings = tuple(text.strip() for text in match[2].split(",")) if match else ()
+    if match is None or not all(re.fullmatch(r"[\w.]+=.+", text) for text in settings):
+        raise InputError(DOING, f"renderer {name!r}", "no settings in its brackets", "write FIXER[KEY=VALUE,...]: onefixer[references=0]")
+    return match[1] + match[3], settings
+
+
+def split_names(text: str) -> list[str]:
+    """Split a list of names at its commas, but for those in brackets.
+
+    Example:
+        >>> split_names("3dgs, onefixer[references=0,recording=past]")
+        ['3dgs', 'onefixer[references=0,recording=past]']
+    """
+    return [name.strip() for name in re.split(r",(?![^\[]*\])", text) if name.strip()]
 
 
 def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
