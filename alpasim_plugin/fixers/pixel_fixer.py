@@ -28,7 +28,9 @@ from alpasim_plugin.nets.pixel_source import content_key, pixel_noise, sparse_so
 from alpasim_plugin.nets.schedule import from_names, interpolant
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
-RECORDED = "recorded_share"  # fact of a frame: how much of the picture its references are, 0 to 1
+# Facts of a frame, 0 to 1: how much of the picture its references are, and how much the generator itself has made up.
+RECORDED, GUESSED = "recorded_share", "guessed_share"
+MADE_UP = 0.25  # a pixel that differs from the render by so much, of a range of 2, is the generator's own altogether
 
 
 @dataclass(frozen=True)
@@ -167,8 +169,7 @@ class PixelFixer(Fixer):
         for view in views:
             for camera, index, made, event in self._fix(view, pasts):
                 frame = replace(block[index[0]], references=())
-                if view.references is not None:
-                    frame = replace(frame, facts={**frame.facts, RECORDED: float(made.state.recorded.mean())})
+                frame = replace(frame, facts={**frame.facts, **trust(made.state)})
                 out[index[0]] = replace(frame, events=(*frame.events, event)) if event else replace(frame, rgb=made.fixed)
                 after[camera] = made
         return tuple(out), after
@@ -206,6 +207,12 @@ class PixelFixer(Fixer):
                 state = net.start(inputs.render[b : b + 1])
             found.append((camera, view.index[b], CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]), event))
         return found
+
+
+def trust(state: PixelState) -> dict[str, float]:
+    """Return where the last output comes from, as facts of its frame."""
+    own = (state.output - state.render).abs_().mean(dim=-1, keepdim=True).mul_(1 / MADE_UP).clamp_(max=1)
+    return {RECORDED: float(state.recorded.mean()), GUESSED: float((own * (1 - state.recorded)).mean())}
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:

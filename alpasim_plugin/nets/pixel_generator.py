@@ -220,7 +220,7 @@ class PixelGenerator(nn.Module):
         fine = activation(self.refine(fine), inplace=True)
         out, recorded = pixels(self.write(fine), DETAIL).float() + render, torch.zeros_like(render[..., :1])
         if self.blend is not None and references is not None and beside is not None:
-            out, recorded = self.blend(fine, render, out, references, beside)
+            out, recorded = self.blend(y, fine, out, references, beside)
         return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames, recorded)
 
     @classmethod

@@ -1,9 +1,11 @@
 """What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
 
-    f_k       = act(H (fine + E_k))                                 E_k: what reference k shows beside the render; H is shared
+    a_k       = A (y + C_k)                                         C_k: what reference k shows beside the render, at 1/4; y: the U-Net
+    f_k       = act(H (fine + E_k + U a_k))                         E_k: the same at 1/2; fine: the detail path
     w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
-    x_k       = ref_k(p + 8 px tanh d) + c                          the reference, moved by a learned offset
-    p_0..p_K  = softmax(0, w_k + log v_k(p + 8 px tanh d))          v_k: where reference k holds
+    o_k       = 8 px tanh (D a_k + d)                               a misplaced reference is seen at 1/4, its edges at 1/2
+    x_k       = ref_k(p + o_k) + c                                  the reference, moved by a learned offset
+    p_0..p_K  = softmax(0, w_k + log v_k(p + o_k))                  v_k: where reference k holds
     x         = p_0 (render + residual) + sum_k p_k x_k
 
 All references share one set of weights, so their number and order are free; without any, p_0 is 1 and the generator is the one without
@@ -16,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.nets.pixel_layers import Conv3, activation, cells, pixels
+from alpasim_plugin.nets.pixel_layers import Conv3, Upsample, activation, cells, pixels
 
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
 CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
@@ -38,13 +40,18 @@ class ReferenceBlend(nn.Module):
         super().__init__()
         self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
         self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
+        self.coarse = nn.Linear(CELL**2 * CHANNELS, coarse)
+        self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
+        self.shift = nn.Linear(width, 2)
+        self.up = Upsample(width, detail)
         self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
         self.write = Conv3(width, DETAIL**2 + 2 + DETAIL**2 * 3)
-        for weight in (self.stem.weight, self.read.weight, self.write.weight):
-            nn.init.zeros_(weight)
+        for layer in (self.stem, self.read, self.shift, self.up, self.write):
+            nn.init.zeros_(layer.weight)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
         assert self.write.bias is not None
-        nn.init.zeros_(self.write.bias)
         with torch.no_grad():
             self.write.bias[: DETAIL**2] = DOUBT
 
@@ -60,12 +67,12 @@ class ReferenceBlend(nn.Module):
         mean = beside.mean(dim=1).to(self.stem.weight.dtype)
         return self.stem(cells(mean, CELL)), self.read(cells(mean, DETAIL))
 
-    def forward(self, fine: Tensor, render: Tensor, repaired: Tensor, references: Tensor, beside: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, y: Tensor, fine: Tensor, repaired: Tensor, references: Tensor, beside: Tensor) -> tuple[Tensor, Tensor]:
         """Blend.
 
         Args:
+            y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
-            render: ``(B, H, W, 3)`` in [-1, 1].
             repaired: ``(B, H, W, 3)`` render plus residual.
             references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
             beside: ``(B, K, H, W, 4)`` from `beside_render`.
@@ -74,11 +81,15 @@ class ReferenceBlend(nn.Module):
             ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
         """
         b, k, h, w, _ = references.shape
-        own = self.own(cells(beside.flatten(0, 1).to(fine.dtype), DETAIL))
-        joined = fine[:, None].expand(b, k, *fine.shape[1:]).flatten(0, 1) + own
+        each = beside.flatten(0, 1).to(fine.dtype)
+        at4 = activation(_repeated(y, k) + self.coarse(cells(each, CELL)), inplace=True)
+        for conv in self.align:
+            at4 = activation(conv(at4), inplace=True)
+        joined = _repeated(fine, k) + self.own(cells(each, DETAIL)) + self.up(at4)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
         weight, offset, correction = said.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-        moved = _sampled(references.flatten(0, 1), torch.tanh(offset) * OFFSET_PX)
+        seen_at4 = F.interpolate(self.shift(at4).float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+        moved = _sampled(references.flatten(0, 1), torch.tanh(offset + seen_at4.permute(0, 2, 3, 1)) * OFFSET_PX)
         colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
         holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
         logits = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
@@ -91,6 +102,11 @@ def beside_render(references: Tensor, render: Tensor) -> Tensor:
     """Return what the network reads of references: ``(ref - render) v`` and ``v``, ``(B, K, H, W, 4)``."""
     holds = references[..., 3:]
     return torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
+
+
+def _repeated(x: Tensor, times: int) -> Tensor:
+    """Repeat every image of a batch: ``(B, ...)`` to ``(B times, ...)``."""
+    return x[:, None].expand(x.shape[0], times, *x.shape[1:]).flatten(0, 1)
 
 
 def _sampled(images: Tensor, offset: Tensor) -> Tensor:

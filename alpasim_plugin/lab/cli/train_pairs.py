@@ -78,6 +78,9 @@ def pairs(
     split: Annotated[str, typer.Option("--split", help="Splits, comma-separated, in this order.")] = "val,train",
     source: Annotated[str, typer.Option("--source", help="Renderer of the degraded frames.")] = "3dgs",
     max_offset_m: Annotated[float, typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres.")] = 2.5,
+    offset_m: Annotated[
+        float | None, typer.Option("--offset-m", help="One lateral offset from the log for all frames, metres, left positive.")
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the lateral offset.")] = 0,
     count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")] = None,
     jobs: Jobs = 1,
@@ -92,7 +95,7 @@ def pairs(
     if not work:
         raise InputError("making training pairs", str(scenes), f"no scenario in {split}", "make some with 'simrun train scenes'")
     console, began = Console(stderr=True), time.perf_counter()
-    maker = _Maker(out, PairRecipe(source=source, max_offset_m=max_offset_m), seed)
+    maker = _Maker(out, PairRecipe(source=source, max_offset_m=max_offset_m, offset_m=offset_m), seed)
     rows = []
     for number, (scene, made) in enumerate(map_jobs(maker, work, jobs), start=1):
         rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, RunFolder
 from alpasim_plugin.lab.training.frozen_scenes import RECORD, check_scenes, freeze_scenes
-from alpasim_plugin.lab.training.scenes import SPLITS, Split, write_scenes
+from alpasim_plugin.lab.training.scenes import SPLITS, TEST_SPLITS, Split, write_scenes
 
 SCENES_EPILOG = "Example: `simrun train scenes --out data/scenes --split train`"
 CHECK_EPILOG = "Example: `simrun train check-scenes data/scenes`"
@@ -40,15 +40,17 @@ def scenes(
 def check_frozen(
     scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote, with both test splits.")],
     record: Annotated[Path, typer.Option("--record", help="File with the hashes; by default the shipped one.")] = RECORD,
+    splits: Annotated[str, typer.Option("--split", help="Splits to freeze, comma-separated.")] = ",".join(TEST_SPLITS),
     freeze: Annotated[bool, typer.Option("--freeze", help="Write the record, which must not exist yet, instead of checking.")] = False,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
     """Check that the test scenes are those that were frozen before training began."""
     del debug
-    splits = freeze_scenes(scenes, record) if freeze else check_scenes(scenes, record)
-    for name, split in splits.items():
+    names = [name.strip() for name in splits.split(",")]
+    found = freeze_scenes(scenes, record, names) if freeze else check_scenes(scenes, record)
+    for name, split in found.items():
         line = f"{name}: {len(split.scenes)} scenes, {split.sha256[:16]} {'frozen' if freeze else 'as frozen'}"
         Console(stderr=True).print(line, highlight=False, markup=False)
     if as_json:
-        print(json.dumps({name: split.sha256 for name, split in splits.items()}))
+        print(json.dumps({name: split.sha256 for name, split in found.items()}))

@@ -33,6 +33,7 @@ class PairRecipe:
         source: Renderer of the degraded frames.
         target: Renderer of the clean frames.
         max_offset_m: Largest lateral offset from the logged path; the offset varies smoothly, and is zero in cycle renders.
+        offset_m: One lateral offset for all frames, left positive; None lets it vary.
         interval_us: Time between frames.
         camera: Name of the scenario's camera; None for the first.
     """
@@ -40,6 +41,7 @@ class PairRecipe:
     source: str = "3dgs"
     target: str = "clean"
     max_offset_m: float = 2.5
+    offset_m: float | None = None
     interval_us: int = 100_000
     camera: str | None = None
 
@@ -109,6 +111,8 @@ def lateral_offsets(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
 
     A fifth of the sequences stays on the logged path, where a reconstruction is best; so do all cycle renders, which are degraded there.
     """
+    if recipe.offset_m is not None:
+        return np.full(len(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)), recipe.offset_m)
     rng = stream(scenario.scene_id, seed, "training.wander")
     t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
     on_path = rng.random() < 0.2 or scenario.degradation.kind == "cycle"

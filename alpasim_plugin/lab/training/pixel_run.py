@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -112,11 +112,18 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
     tensors = parts_of(load_weights(run.init, dtype=torch.float32)).get("generator")
     if tensors is None:
         raise InputError(DOING, str(run.init), "no part generator.*", "give a checkpoint or a bundle of 'simrun train per-frame'")
-    given = PixelGenerator.from_state_dict(tensors, str(run.init))
-    if replace(given.sizes, blend=net.sizes.blend) != net.sizes or given.sizes.blend not in (0, net.sizes.blend):
-        raise InputError(DOING, str(run.init), f"sizes {given.facts} for {net.facts}", "choose the fixer of the same sizes")
-    net.load_state_dict({**net.state_dict(), **given.state_dict()})  # a bundle that reads no references gets an untrained head
+    own = net.state_dict()
+    wrong = sorted(key for key in tensors.keys() | own.keys() if not key.startswith("blend.") and not _fits(tensors.get(key), own.get(key)))
+    wrong += sorted(key for key in tensors if key.startswith("blend.") and not _fits(tensors[key], own.get(key)))
+    if wrong:
+        found = f"{len(wrong)} tensors of other sizes than {net.facts}, such as {wrong[0]}"
+        raise InputError(DOING, str(run.init), found, "choose the fixer of the same sizes")
+    net.load_state_dict({**own, **tensors})  # a bundle that reads no references gets an untrained blending head
     return net
+
+
+def _fits(given: Tensor | None, own: Tensor | None) -> bool:
+    return given is not None and own is not None and given.shape == own.shape
 
 
 def sizes_of(settings: PixelFixerSettings) -> PixelSizes:

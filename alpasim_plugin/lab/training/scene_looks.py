@@ -50,9 +50,10 @@ UNSEEN_DAMAGE = (
 )
 
 
-def draw_damage(rng: Rng, ranges: DamageRanges) -> Spec:
-    """Return the section ``degradation`` of a scene."""
-    out: Spec = {"kind": "cycle" if rng.random() < CYCLE_SHARE else "reconstruction", "share": log_number(rng, *ranges.share)}
+def draw_damage(rng: Rng, ranges: DamageRanges, kind: str | None = None) -> Spec:
+    """Return the section ``degradation`` of a scene, of a kind that is drawn where none is given."""
+    drawn = "cycle" if rng.random() < CYCLE_SHARE else "reconstruction"
+    out: Spec = {"kind": kind or drawn, "share": log_number(rng, *ranges.share)}
     out |= {"views_per_s": log_number(rng, *ranges.views_per_s, digits=2), "depth_error": number(rng, *ranges.depth_error, digits=3)}
     posed, pose_error_m = rng.random() < 0.5, number(rng, *ranges.pose_error_m, digits=3)
     out["pose_error_m"] = pose_error_m if posed or ranges.pose_error_m[0] > 0 else 0.0

@@ -26,8 +26,9 @@ from alpasim_plugin.lab.training.scene_looks import (  # fmt: skip
 )
 from scenarios.load import load_scenario
 
-Split = Literal["train", "val", "test-known", "test-unseen"]
+Split = Literal["train", "val", "test-known", "test-unseen", "beside-known", "beside-unseen"]
 TEST_SPLITS: tuple[Split, ...] = ("test-known", "test-unseen")
+BESIDE_SPLITS: tuple[Split, ...] = ("beside-known", "beside-unseen")  # tests of fixed distances from the recorded path
 DRAWS = 8  # samples per scene: one that the expert cannot drive is rejected
 
 
@@ -42,6 +43,7 @@ class SplitRecipe:
         duration_s: Length of every drive by default.
         unseen: Whether looks and damage are those that training never sees.
         own_cameras: Whether cameras are drawn; else all scenes have the default camera.
+        cycles: Whether some scenes are cycle renders, which lie on the logged path.
     """
 
     families: Mapping[str, Family]
@@ -50,6 +52,7 @@ class SplitRecipe:
     duration_s: float
     unseen: bool = False
     own_cameras: bool = False
+    cycles: bool = True
 
 
 SPLITS: Mapping[Split, SplitRecipe] = {
@@ -57,6 +60,8 @@ SPLITS: Mapping[Split, SplitRecipe] = {
     "val": SplitRecipe(KNOWN_FAMILIES, 12_000_000, 24, 6.0),
     "test-known": SplitRecipe(KNOWN_FAMILIES, 13_000_000, 30, 19.8),
     "test-unseen": SplitRecipe(UNSEEN_FAMILIES, 14_000_000, 30, 19.8, unseen=True),
+    "beside-known": SplitRecipe(KNOWN_FAMILIES, 15_000_000, 12, 9.0, cycles=False),
+    "beside-unseen": SplitRecipe(UNSEEN_FAMILIES, 16_000_000, 6, 9.0, unseen=True, cycles=False),
 }
 
 
@@ -80,10 +85,11 @@ def draw_spec(split: Split, family: str, scene_id: str, seed: int, duration_s: f
     spec["environment"] = unseen_surroundings(looks) if recipe.unseen else known_surroundings(looks)
     if recipe.own_cameras:
         spec["cameras"] = [draw_camera(looks)]
+    kind = None if recipe.cycles else "reconstruction"
     ranges = UNSEEN_DAMAGE[int(damage.integers(len(UNSEEN_DAMAGE)))] if recipe.unseen else KNOWN_DAMAGE
     return {
         "version": 1, "scene_id": scene_id, "seed": seed, "tags": ["training", split, family],
-        "timing": {"duration_us": round(duration_s * 1e6)}, **spec, "degradation": draw_damage(damage, ranges),
+        "timing": {"duration_us": round(duration_s * 1e6)}, **spec, "degradation": draw_damage(damage, ranges, kind),
     }  # fmt: skip
 
 
