@@ -33,7 +33,7 @@ CONSISTENT_PX = 1.0  # forward and backward flow agree within this: the neighbou
 OPEN_SEQUENCES, PICTURES = 100, 64  # kept in memory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReferenceDraw:
     """What references the frames of an episode have.
 

@@ -76,6 +76,7 @@ class PixelSample:
             corner its grid would lie on the generator's, which then learns a pattern of period 4 that only this network prefers.
         t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
         references: ``(B, T, K, H, W, 4)`` recorded frames in the view: colour in [-1, 1], and where it holds, 0 to 1.
+            None: there is none.
     """
 
     render: Tensor
@@ -89,7 +90,7 @@ class PixelSample:
     perceptual_frames: Sequence[int]
     corner: tuple[int, int]
     t_history: Tensor
-    references: Tensor
+    references: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def pixel_losses(
     outputs, flow = [], zero
     for i in range(frames):
         render, opacity, truth = sample.render[:, i], sample.opacity[:, i], sample.truth[:, i]
-        references = sample.references[:, i]
+        references = None if sample.references is None else sample.references[:, i]
         sdmap = sample.sdmap[:, i] if objectives.use_map else torch.full_like(render, -1.0)
         if objectives.flow and i == sample.flow_frame:
             source = _source(render, opacity, sample.eps_flow, objectives)

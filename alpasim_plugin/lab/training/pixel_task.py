@@ -42,8 +42,8 @@ class FrameBatch(Protocol):
         ...
 
     @property
-    def references(self) -> Tensor:
-        """``(B, T, K, H, W, 4)`` recorded frames in the view."""
+    def references(self) -> Tensor | None:
+        """``(B, T, K, H, W, 4)`` recorded frames in the view; None where there is none."""
         ...
 
     @property

@@ -8,7 +8,16 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.training.streams import KINDS, StreamBatch, StreamShares, TrainingStreams, _detailed, there_and_back
+from alpasim_plugin.lab.training.episode_references import SLOTS
+from alpasim_plugin.lab.training.streams import (
+    KINDS,
+    StreamBatch,
+    StreamShares,
+    TrainingStreams,
+    _detailed,
+    _lit_references,
+    there_and_back,
+)
 from tests.lab.training.pair_files import make
 
 ALL_KINDS = StreamShares(0.25, 0.25, 0.25, 0.25)
@@ -68,7 +77,7 @@ def test_frames_follow_one_another_across_updates(root: Path) -> None:
             (episode, at), (before, _) = made.episode_of(slot, i), made.episode_of(slot, i - 1)
             if at == 0:
                 continue
-            assert replace(episode, levels=before.levels) == before
+            assert replace(episode, levels=before.levels, references=before.references) == before
             length = len(episode.sequence.clip)
             raw = episode.start + episode.step * np.arange(at * 2 - 1, at * 2 + 1)
             assert np.abs(np.diff(there_and_back(raw, length))).max() <= abs(episode.step)
@@ -95,6 +104,9 @@ def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
         batch = made.update(i)
         for slot, kind in enumerate(batch.kind.tolist()):
             (episode, at) = made.episode_of(slot, i)
+            if episode.grey:
+                assert np.ptp(batch.target[slot].numpy(), axis=1).max() < 0.5  # the grain alone
+                continue
             index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
             raw = episode.sequence.clip.rgb_gt[index, episode.top : episode.top + 32, episode.left : episode.left + 48]
             raw = raw[:, :, ::-1] if episode.flip else raw
@@ -168,3 +180,21 @@ def test_video_needs_a_folder_and_shares_must_add_up(root: Path) -> None:
         TrainingStreams(root / "pairs", None, crop=(32, 48))
     with pytest.raises(InputError, match=r"add up to 1\.1"):
         StreamShares(0.8, 0.1, 0.1, 0.1)
+
+
+def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_better(root: Path) -> None:
+    made = streams(root, shares=StreamShares(1, 0, 0, 0))
+    batch = made.update(3)
+    assert batch.references.shape == (3, 2, SLOTS, 32, 48, 4)
+    assert not batch.references.any()  # these sequences have no recording
+    episodes = [made.episode_of(slot, i)[0] for slot in range(3) for i in range(0, 240, 4)]
+    assert {episode.grey for episode in episodes} == {True, False}
+    assert 0.1 < np.mean([episode.better > 0 for episode in episodes]) < 0.4
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (2, SLOTS, 4, 6, 4), dtype=np.uint8)
+    images[..., 3] = 255
+    plain = replace(episodes[0], flip=False, levels=np.repeat(np.linspace(-1, 1, 256, dtype=np.float32)[:, None], 3, axis=1))
+    exact = replace(plain, references=replace(plain.references, gains=np.ones((SLOTS, 3))))
+    shown = _lit_references(images, exact)
+    assert np.abs(shown[..., :3] - (images[..., :3] / 127.5 - 1)).max() < 1e-5
+    assert np.array_equal(_lit_references(images, replace(exact, flip=True)), shown[:, :, :, ::-1])

@@ -1,0 +1,104 @@
+"""References of training episodes: cut as the frames are, absent where they are missing, wrong where they are drawn so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.types import U8, Actor, Box, RecordedFrame, Trajectory
+from alpasim_plugin.lab.training.episode_references import SLOTS, ReferenceDraw, draw_references, pair_references, video_references
+from alpasim_plugin.lab.training.map_errors import CHANCES, MapError, draw_map_error, is_paint, with_error
+from alpasim_plugin.lab.training.pair_store import PairSequence, write_sequence
+from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
+from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
+from tests.lab.training.pair_files import make, pair
+
+FRAMES, HEIGHT, WIDTH = 6, 32, 48
+EXACT = ReferenceDraw(2, 0, np.zeros((SLOTS, 6)), np.ones((SLOTS, 3)), -1, 0)
+INDEX = np.arange(3)
+K = [[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> PairSequence:
+    """Give a sequence with three recorded frames; a wall stands 10 m ahead."""
+    folder = tmp_path_factory.mktemp("references") / "train" / "a"
+    wall = np.full((HEIGHT, WIDTH), 10, np.float16)
+    car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
+
+    def recorded(i: int) -> RecordedFrame:
+        T = np.eye(4)
+        T[0, 3] = 2.0 * i
+        return RecordedFrame(200_000 * i, "front", np.array(K), T, {}, lambda: (pair(10 * i).rgb_gt, wall.astype(np.float32)))
+
+    def beside(partial: Path) -> None:
+        write_references(partial, [FrameGeometry(wall, {})] * FRAMES, [recorded(i) for i in range(3)], [car])
+
+    write_sequence(folder, (pair(i) for i in range(FRAMES)), FRAMES, {"camera": {"K": K}}, beside)
+    return PairSequence(folder)
+
+
+def shown(sequence: PairSequence, draw: ReferenceDraw, rows: slice = slice(0, HEIGHT), columns: slice = slice(0, WIDTH)) -> U8:
+    return pair_references(sequence, draw, INDEX, rows, columns)
+
+
+def test_a_crop_has_the_references_of_the_whole_frame_cut_to_it(sequence: PairSequence) -> None:
+    rows, columns = slice(8, 24), slice(16, 48)
+    whole, part = shown(sequence, EXACT), shown(sequence, EXACT, rows, columns)
+    assert part.shape == (3, SLOTS, 16, 32, 4)
+    assert np.abs(whole[:, :, rows, columns].astype(int) - part).max() <= 1
+
+
+def test_as_many_references_as_drawn_and_none_without_a_recording(sequence: PairSequence, tmp_path: Path) -> None:
+    for count in range(SLOTS + 1):
+        there = shown(sequence, replace(EXACT, count=count)).any(axis=(0, 2, 3, 4))
+        assert there.tolist() == [True] * count + [False] * (SLOTS - count)
+    assert not shown(make(tmp_path), EXACT).any()
+
+
+def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_else(sequence: PairSequence) -> None:
+    exact = shown(sequence, EXACT)[:, 0]
+    errors = np.zeros((SLOTS, 6))
+    errors[0, 0] = 0.5
+    for other in (replace(EXACT, skipped=1), replace(EXACT, errors=errors), replace(EXACT, wrong=0)):
+        assert not np.array_equal(shown(sequence, other)[:, 0], exact)
+
+
+def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(96), np.arange(64))
+    smooth = (127 + 100 * np.sin(x / 7) * np.cos(y / 5)).astype(np.uint8)
+    still = pair(3, 64, 96)._replace(rgb_gt=np.stack([smooth] * 3, axis=-1))
+    write_sequence(tmp_path / "v", (still._replace(t_us=i) for i in range(24)), 24, {})
+    clip = PairSequence(tmp_path / "v").clip
+    index = np.arange(10, 13)
+    draws = [replace(EXACT, seed=seed, count=1) for seed in range(24)]
+    found = [video_references(clip, draw, index, slice(0, 64), slice(0, 96)) for draw in draws]
+    same = [np.abs(images[:, 0, 8:-8, 8:-8, :3].astype(int) - still.rgb_gt[8:-8, 8:-8]).mean() < 2 for images in found]
+    assert any(same)
+    assert not all(same)  # most flows are bent
+
+
+def test_draws_have_every_count_and_every_error_of_the_map() -> None:
+    rng = np.random.default_rng(0)
+    draws = [draw_references(rng) for _ in range(400)]
+    assert {draw.count for draw in draws} == set(range(SLOTS + 1))
+    assert {draw_map_error(rng).kind for _ in range(400)} == set(CHANCES)
+
+
+def test_errors_of_the_map_do_what_their_names_say() -> None:
+    sdmap = np.zeros((1, 20, 30, 3), np.uint8)
+    sdmap[:, 10, :] = COLOURS["line_white"]
+    sdmap[:, 12, :] = (np.array(COLOURS["line_yellow"]) * 0.3).astype(np.uint8)  # far away
+    sdmap[:, 14, :] = COLOURS["road_boundary"]
+    sdmap[:, 16, :] = BOX_COLOURS["car"][0]
+    error = MapError("true", (3.0, 2.0), 0.0, 1.0)
+    assert np.array_equal(with_error(sdmap, error), sdmap)
+    assert not with_error(sdmap, replace(error, kind="missing")).any()
+    unpainted = with_error(sdmap, replace(error, kind="unpainted"))
+    assert unpainted.any(axis=(0, 2, 3)).tolist() == [row in (14, 16) for row in range(20)]
+    assert is_paint(sdmap).any(axis=(0, 2)).tolist() == [row in (10, 12) for row in range(20)]
+    shifted = with_error(sdmap, replace(error, kind="shifted", shift_px=(0.0, 2 * 256 / 30)))
+    assert shifted.any(axis=(0, 2, 3)).tolist() == [row in (12, 14, 16, 18) for row in range(20)]
