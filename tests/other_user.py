@@ -20,16 +20,16 @@ SHOW = """
 mount -t tmpfs -o mode=755 none /mnt && mkdir /mnt/keep && mount --bind "{prefix}" /mnt/keep
 mount -t tmpfs -o mode=755 none "{closed}" && mkdir -p "{prefix}" && mount --move /mnt/keep "{prefix}"
 """
-READ_ONLY = 'mount --bind / /mnt && mount -o remount,bind,ro / && for one in {writable}; do mount -t tmpfs -o mode=1777 none "$one"; done\n'
 
 
-def _works() -> bool:
+def can_become_nobody() -> bool:
+    """Tell whether this process may change its user and mount, in a file system of its own."""
     if os.getuid() != 0 or any(shutil.which(tool) is None for tool in TOOLS):
         return False
     return subprocess.run(["unshare", "-m", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True, check=False).returncode == 0
 
 
-as_root = pytest.mark.skipif(not _works(), reason="needs root that may mount, to become another user")
+as_root = pytest.mark.skipif(not can_become_nobody(), reason="needs root that may mount, to become another user")
 
 
 @contextmanager
