@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.lazy import lazy_names
+from alpasim_plugin.io import places
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.one_policy import serve_policy
@@ -52,6 +53,7 @@ def _claim_packages() -> None:
 
 
 _claim_packages()
+places.prepare()
 
 
 __getattr__ = lazy_names(

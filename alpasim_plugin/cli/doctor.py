@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -13,7 +12,9 @@ import numpy as np
 import typer
 
 from alpasim_plugin.cli.options import Json
-from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.errors import InfrastructureError, SimrunError
+from alpasim_plugin.io import places
+from alpasim_plugin.io.places import temporary_folder
 from alpasim_plugin.runtime.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"
@@ -30,8 +31,11 @@ def doctor(
         "video": _video,
         "log messages": _wire,
         "disk": _disk,
+        "cache": lambda: _writable(places.cache()),
+        "kernels": lambda: _writable(places.kernels()),
+        "scratch": lambda: _writable(places.scratch()),
     }
-    needed = {"rasteriser (cpu)", "fixer", "video", "log messages", "disk"}
+    needed = {"rasteriser (cpu)", "fixer", "video", "log messages", "disk", "kernels"}
     rows = []
     for name, check in checks.items():
         try:
@@ -80,7 +84,7 @@ def _video() -> str:
     from alpasim_plugin.log.video import read_mp4, write_mp4
 
     frames = [np.full((32, 48, 3), 40 * i, dtype=np.uint8) for i in range(4)]
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder("simrun-doctor-") as folder:
         path = Path(folder) / "test.mp4"
         write_mp4(path, frames, 10)
         return f"H.264: {len(read_mp4(path).frames)} frames written and read back"
@@ -90,6 +94,18 @@ def _wire() -> str:
     from alpasim_plugin import wire
 
     return f"compiled messages load: {wire.__name__}"
+
+
+def _writable(place: places.Place) -> str:
+    """Say which folder was chosen and why; it may not exist yet.
+
+    Raises:
+        InfrastructureError: It cannot be written, or others may.
+    """
+    trouble = places.trouble_of(place)
+    if trouble:
+        raise InfrastructureError("choosing folders", str(place), f"{place}: {trouble}", places.DO_THIS)
+    return str(place)
 
 
 def _disk() -> str:

@@ -6,8 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Literal, SupportsFloat
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -21,6 +20,7 @@ from alpasim_plugin.core.plan_check import plan_problem
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.core.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec, Trajectory, Vehicle
 from alpasim_plugin.gym.reward import Instant, Reward, Scorer
+from alpasim_plugin.io.places import temporary_folder
 from alpasim_plugin.plugins.interfaces import Controller
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.cell import make_renderer
@@ -28,6 +28,9 @@ from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import Loop
 from alpasim_plugin.runtime.scoring import score_log
 from scenarios.load import load_scenario
+
+if TYPE_CHECKING:
+    from tempfile import TemporaryDirectory
 
 PREDICTED_US, PREDICTED_STEP_US = 2_000_000, 100_000  # of the plan that stands in the log for a held command
 FORWARD_M, BACKWARD_M, ASIDE_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame
@@ -209,7 +212,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         drawn_seed = int(self.np_random.integers(ROLLOUT_SEEDS))
         self._scenario = self._scenarios[int(wanted.get("scene_seed", drawn_scene))]
         rollout_seed = int(wanted.get("seed", derive_seed(self._scenario.scene_id, drawn_seed, "gym") % ROLLOUT_SEEDS))
-        self._folder = TemporaryDirectory(prefix="simrun-gym-")
+        self._folder = temporary_folder("simrun-gym-")
         self._recorder = _Watching(self._scenario, rollout_seed, Path(self._folder.name))
         session = make_renderer(self._renderer, self._scenario, rollout_seed, threads=1)
         self._loop = Loop(self._scenario, session, self._sensors, self._actions.controller, self._recorder)

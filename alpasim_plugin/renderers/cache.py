@@ -1,12 +1,11 @@
 """Content-addressed cache of folders: each entry is made once, by the first process that needs it, and appears atomically.
 
-$SIMRUN_CACHE or ~/.cache/simrun / KIND / KEY/        what was made
-                                       / KEY.lock     held by the process that makes it
+CACHE / KIND / KEY/        what was made
+             / KEY.lock     held by the process that makes it
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import time
@@ -14,7 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io import places
 from alpasim_plugin.io.atomic import atomic_folder
 from alpasim_plugin.io.lock import one_writer
 
@@ -23,9 +23,15 @@ DOING, DO_THIS = "writing to the cache", "free disk space, or name a writable fo
 
 
 def cache_root() -> Path:
-    """Return the folder of the cache: ``$SIMRUN_CACHE``, or ``~/.cache/simrun``."""
-    named = os.environ.get("SIMRUN_CACHE")
-    return Path(named).expanduser() if named else Path.home() / ".cache" / "simrun"
+    """Return the folder of the cache (`alpasim_plugin.io.places.cache`).
+
+    Raises:
+        InfrastructureError: No folder can be written.
+    """
+    found = places.cache().path
+    if found is None:
+        raise InfrastructureError(DOING, "the cache", "no folder can be written", places.DO_THIS)
+    return found
 
 
 def cached(kind: str, key: str, make: Callable[[Path], None], read: Callable[[Path], T], what: str, *, again: bool = False) -> T:

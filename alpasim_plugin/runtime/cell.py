@@ -17,6 +17,7 @@ from alpasim_plugin.control import Controller
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.io.atomic import disk_error
+from alpasim_plugin.io.places import require_kernels
 from alpasim_plugin.plugins.interfaces import Policy, Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.process.stdout import parts_print_to_stderr
@@ -262,7 +263,9 @@ def make_renderer(
     Raises:
         InputError: Unknown name, device or setting, or weights that are missing or wrong.
         RendererError: The device does not work.
+        InfrastructureError: Kernels cannot be compiled: no folder can be written.
     """
+    require_kernels()
     spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
     session = {"seed": seed, "device": device, "threads": threads}
     base: Renderer = build(spec.base, scenario=scenario, **session)

@@ -6,7 +6,6 @@ policy instance of its own, which sees its frames and is queried at the same ins
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.types import F64, Frame, Observation, Plan, RenderRequest, Route, SensorSpec, Trajectory
 from alpasim_plugin.io.atomic import write_bytes, write_json
+from alpasim_plugin.io.places import temporary_folder
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.trace import first_difference
 from alpasim_plugin.plugins.interfaces import Policy, Renderer
@@ -155,7 +155,7 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
     policy = _MultiPolicy({name: p.policy for name, p in parts.items()}, renderer)
     if not policy.sensors:
         raise InputError(DOING, past.name, f"the policy {own.policy.name!r} has no camera", "probe a rollout of a policy with cameras")
-    with tempfile.TemporaryDirectory(prefix="simrun-probe-") as folder:
+    with temporary_folder("simrun-probe-") as folder:
         with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
             run_rollout(past.scenario, renderer, policy, own.seed, recorder, parts[own.renderer.name].controller)
         one, other = log_trace(past.folder), log_trace(Path(folder))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +31,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.io.places import temporary_folder
 from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.plugins.interfaces import Renderer
@@ -165,7 +165,7 @@ class Recorder:
         keep_frames: bool = False,
         versions: Mapping[str, str] | None = None,
     ) -> None:
-        self._temporary = tempfile.TemporaryDirectory(prefix="simrun-") if folder is None else None
+        self._temporary = temporary_folder("simrun-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
         self._scenario, self._seed = scenario, seed
         self._session = session_uuid(seed, session or f"{scenario.scene_id}/{seed}")

@@ -15,11 +15,14 @@ import numpy.typing as npt
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.core.types import F64, I64, Bool
 
 Z95 = 1.96
 LEVEL = 0.95
 TAIL = (1 - LEVEL) / 2
+ROUNDING = 1e-12  # values that differ by no more than this, relative, are equal
+TOO_LARGE = "the values are too large for their spread to be a number"
+LARGE = 1e150  # the squares of larger values are no numbers
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,11 @@ def within(interval: Interval, low: float, high: float) -> Interval:
     return replace(interval, low=min(max(interval.low, low), high), high=max(min(interval.high, high), low))
 
 
+def are_alike(values: F64) -> Bool:
+    """Tell whether the values on the last axis of ``(..., n)`` are equal but for rounding."""
+    return np.asarray(np.ptp(values, axis=-1) <= ROUNDING * np.max(np.abs(values), axis=-1))
+
+
 def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
     """Return 1.96 s / sqrt(N) with the sample standard deviation s of ``(N,)`` values (paper, appendix), and why it is missing.
 
@@ -63,7 +71,15 @@ def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
     x = np.asarray(values, dtype=np.float64)
     if len(x) < 2:
         return None, "one rollout has no spread"
-    return Z95 * float(np.std(x, ddof=1)) / float(np.sqrt(len(x))), ""
+    half = scaled(x)[1] * Z95 * float(np.std(scaled(x)[0], ddof=1)) / float(np.sqrt(len(x)))
+    return (half, "") if np.isfinite(half) else (None, TOO_LARGE)
+
+
+def scaled(values: F64) -> tuple[F64, float]:
+    """Return values whose squares are finite, and what to multiply with; 1 but for very large values."""
+    most = float(np.max(np.abs(values), initial=0.0))
+    scale = most if most > LARGE else 1.0
+    return values / scale, scale
 
 
 def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
@@ -74,13 +90,16 @@ def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
         >>> round(one.low, 4), round(one.high, 4)
         (-0.4841, 4.4841)
     """
-    x = np.asarray(values, dtype=np.float64)
-    centre = float(np.mean(x))
+    x, scale = scaled(np.asarray(values, dtype=np.float64))
+    centre = float(np.mean(x)) * scale
     if len(x) < 2:
         return Interval(centre, reason=f"needs at least two {what}, found {len(x)}")
-    low, high = t_bounds(x)
-    note = f"all {len(x)} {what} are equal: the interval has no width" if low == high else ""
-    return Interval(centre, float(low), float(high), note=note, method=f"t on {what}")
+    if are_alike(x):
+        return Interval(centre, centre, centre, note=f"all {len(x)} {what} are equal: the interval has no width", method=f"t on {what}")
+    low, high = (float(bound) * scale for bound in t_bounds(x))
+    if not np.isfinite([low, high]).all():
+        return Interval(centre, reason=TOO_LARGE)
+    return Interval(centre, low, high, method=f"t on {what}")
 
 
 def t_bounds(means: F64) -> tuple[F64, F64]:
@@ -101,7 +120,7 @@ def logit_t_bounds(means: F64) -> tuple[F64, F64]:
     n = means.shape[-1]
     p = means.mean(axis=-1)
     error = means.std(axis=-1, ddof=1) / np.sqrt(n)
-    flat = np.ptp(means, axis=-1) == 0.0
+    flat = are_alike(means)
     inside = np.where(flat | (p <= 0.0) | (p >= 1.0), 0.5, p)
     logit = np.log(inside / (1 - inside))
     half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error / (inside * (1 - inside))
@@ -120,12 +139,13 @@ def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple
         clusters: Name of each value's cluster, or its number from 0 up; the result is in their order, without numbers that no value has.
     """
     group = np.asarray(clusters)
+    x, scale = scaled(np.asarray(values, dtype=np.float64))
     if not np.issubdtype(group.dtype, np.integer):  # names; numbers are not sorted, as a run may have millions of cells
         group = np.unique(group, return_inverse=True)[1].reshape(-1)
     size = np.bincount(group)
     there = size > 0
-    total = np.bincount(group, weights=np.asarray(values, dtype=np.float64))
-    return total[there] / size[there], size[there]
+    total = np.bincount(group, weights=x)
+    return total[there] / size[there] * scale, size[there]
 
 
 def n_clusters(clusters: I64) -> int:
@@ -160,7 +180,7 @@ def rate_interval(means: F64) -> Interval:
     if n < 2:
         return Interval(centre, reason=f"needs at least two scenes, found {n}")
     low, high = logit_t_bounds(means)
-    if np.ptp(means) == 0.0:
+    if are_alike(means):
         note = f"{centre * n:g} of {n} scenes: exact bounds, as equal scenes have no spread"
         return Interval(centre, float(low), float(high), note=note, method="exact, scenes as trials")
     return Interval(centre, float(low), float(high), method="t on scenes, logit scale")
@@ -197,9 +217,9 @@ def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float
 
     None where either has no spread. 4 means that the paper's interval is half as long as it should be.
     """
-    x = np.asarray(values, dtype=np.float64)
+    x, _ = scaled(np.asarray(values, dtype=np.float64))
     means, _ = cluster_means(x, clusters)
-    if len(means) < 2 or np.ptp(x) == 0.0:
+    if len(means) < 2 or are_alike(x):
         return None
     return float(np.var(means, ddof=1) / len(means) / (np.var(x, ddof=1) / len(x)))
 
@@ -239,13 +259,13 @@ def cluster_bootstrap(values: npt.ArrayLike, clusters: Sequence[str] | I64, draw
         >>> 0.0 <= one.low < 1.5 < one.high <= 3.0
         True
     """
-    means, _ = cluster_means(values, clusters)
-    centre = float(np.mean(means))
+    means, scale = scaled(cluster_means(values, clusters)[0])
+    centre = float(np.mean(means)) * scale
     if len(means) < 2:
         return Interval(centre, reason=f"needs at least two scenes, found {len(means)}")
     places = drawn(len(means))
-    low, high = np.quantile(means.take(places).mean(axis=1), [TAIL, 1 - TAIL])
-    note = f"all {len(means)} scenes are equal: the interval has no width" if low == high else ""
+    low, high = np.quantile(means.take(places).mean(axis=1), [TAIL, 1 - TAIL]) * scale
+    note = f"all {len(means)} scenes are equal: the interval has no width" if are_alike(means) else ""
     return Interval(centre, float(low), float(high), note=note, method=f"cluster bootstrap, {len(places)} draws")
 
 

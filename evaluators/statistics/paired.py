@@ -15,8 +15,19 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.run_folder.sides import Cell, Row, Side, by_renderer, metric_names
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.statistics.intervals import Interval, cluster_means, logit_t_bounds, n_clusters, t_bounds, t_interval, within
-from evaluators.statistics.verdicts import LEAST_DECIDED_FLAGS, difference, harm, more_scenes, p_value, sign_test, verdict
+from evaluators.statistics.bounded import mean_bounds
+from evaluators.statistics.intervals import (
+    TOO_LARGE,
+    Interval,
+    are_alike,
+    cluster_means,
+    logit_t_bounds,
+    n_clusters,
+    scaled,
+    t_interval,
+    within,
+)
+from evaluators.statistics.verdicts import LEAST_SCENES, REACH, difference, harm, more_scenes, p_value, sign_test, verdict
 
 Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
 
@@ -114,7 +125,8 @@ def compare(
 
     Returns:
         ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
-        and its ``method``; ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference`` (better,
+        and its ``method``; ``guarded`` (the bounds that non-inferior must hold for, or None: `difference_bounds`); ``p_value`` and
+        ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference`` (better,
         worse, none shown; independent of the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
         ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
         exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
@@ -129,6 +141,7 @@ def compare(
         "diff": None,
         "ci95": None,
         "method": None,
+        "guarded": None,
         "p_value": None,
         "test": None,
         "margin": margin,
@@ -144,71 +157,101 @@ def compare(
     }
     if not len(pairs.mine):
         return entry | {"reason": NO_PAIR}
-    delta = pairs.mine - pairs.base
+    with np.errstate(over="ignore"):
+        delta = pairs.mine - pairs.base
+    if not np.isfinite(delta).all():
+        return entry | {"reason": TOO_LARGE}
     means, _ = cluster_means(delta, pairs.scenes)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
     entry["scenes"] = {"up": up, "down": down, "same": len(means) - up - down, "p_value": sign_test(up, down)}
     if metric.is_flag:
         gained, lost = int(np.sum((pairs.mine > 0) & (pairs.base == 0))), int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
         entry["cells"] = {"only_here": gained, "only_baseline": lost, "p_value": sign_test(gained, lost)}
-    interval = flag_interval(delta, pairs.scenes) if metric.is_flag else t_interval(means, "scenes")
+    interval, guarded = difference_bounds(delta, pairs.scenes, metric, margin)
     interval = within(interval, *metric.difference_range)
     entry["diff"], entry["ci95"], entry["method"] = interval.centre, interval.bounds, interval.method or None
     if interval.reason:
         return entry | {"reason": interval.reason}
-    if interval.note:
-        entry["note"] = interval.note
-    entry["spread"] = float(np.std(means, ddof=1))
+    entry["guarded"], entry["spread"] = guarded, scaled(means)[1] * float(np.std(scaled(means)[0], ddof=1))
     entry["p_value"], entry["test"] = p_value(means, metric.is_flag)
-    entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, metric.direction)
-    entry["difference"] = difference(interval.bounds, entry["p_value"], metric.direction)
+    notes = [interval.note] if interval.note else []
+    if len(means) >= LEAST_SCENES:
+        entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, metric.direction, guarded)
+        entry["difference"] = difference(interval.bounds, entry["p_value"], metric.direction)
+    else:
+        notes.append(f"{len(means)} scenes: a verdict needs at least {LEAST_SCENES}")
+    if entry["verdict"] == "undecided" and verdict(interval.bounds, 1.0, margin, metric.direction) == "non-inferior":
+        worst = f"{reach_of(metric, margin):g} {metric.unit}".rstrip()
+        notes.append(f"{len(means)} scenes cannot exclude that a few others are worse by up to {worst}")
+    if notes:
+        entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
         seen = abs(interval.centre) if metric.direction == "none" else harm([interval.centre] * 2, metric.direction)[0]
-        entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, metric.is_flag)
+        entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, reach_of(metric, margin) or None)
     return entry
 
 
-def flag_interval(delta: F64, scenes: Sequence[str] | I64) -> Interval:
-    """Return the interval of a difference of rates; see `flag_bounds`.
+def difference_bounds(delta: F64, scenes: I64, metric: MetricInfo, margin: float) -> tuple[Interval, list[float] | None]:
+    """Return the interval of a mean difference, and the guarded bounds that "non-inferior" must hold for; None where there are none.
+
+    Rates take the interval of `flag_interval`, other quantities with bounds that of `evaluators.statistics.bounded`, all others t. The
+    guarded bounds allow for scenes at the worst possible value that were not drawn; without bounds, differences are cut to `reach_of`.
 
     Args:
-        delta: ``(N,)`` differences per cell, in [-1, 1].
+        delta: ``(N,)`` differences per cell.
         scenes: Scene of each cell.
+        metric: What it is.
+        margin: How much worse is accepted.
     """
+    means, _ = cluster_means(delta, scenes)
+    n, reach = len(means), reach_of(metric, margin)
+    if n < 2:
+        return Interval(float(np.mean(means)), reason=f"needs at least two scenes, found {n}"), None
+    guarded = list(mean_bounds(means, -reach, reach)) if reach else None
+    if metric.is_flag:
+        return flag_interval(delta, scenes), guarded
+    plain = t_interval(means, "scenes")
+    if guarded is None or plain.bounds is None or not (are_alike(means) or np.isfinite(metric.difference_range).all()):
+        return plain, guarded
+    note = f"all {n} scenes are equal, so that they have no spread to go by" if are_alike(means) else ""
+    method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
+    return Interval(plain.centre, *guarded, note=note, method=method), guarded
+
+
+def flag_interval(delta: F64, scenes: I64) -> Interval:
+    """Return the interval of a difference of rates from ``(N,)`` differences per cell, in [-1, 1], and their scenes; see `flag_bounds`."""
     gained, _ = cluster_means(np.maximum(delta, 0.0), scenes)
     lost, _ = cluster_means(np.maximum(-delta, 0.0), scenes)
-    n, centre = len(gained), float(np.mean(gained - lost))
-    if n < 2:
-        return Interval(centre, reason=f"needs at least two scenes, found {n}")
     low, high = (float(b) for b in flag_bounds(gained, lost))
     changed = int(np.sum((gained > 0) | (lost > 0)))
-    if changed >= LEAST_DECIDED_FLAGS:
-        note = f"all {n} scenes are equal: the interval has no width" if low == high else ""
-        return Interval(centre, low, high, note=note, method="t on scenes")
-    note = f"{changed} of {n} scenes changed: bounds joined from those of gained and lost events"
-    return Interval(centre, low, high, note=note, method="gained and lost rates joined")
+    note = f"{changed} of {len(gained)} scenes changed" if changed < LEAST_SCENES else ""
+    return Interval(float(np.mean(gained - lost)), low, high, note=note, method="gained and lost rates joined")
 
 
 def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
-    """Return bounds ``(...,)`` of a difference of rates.
+    """Return bounds ``(...,)`` of a difference of rates; never without width.
 
-    A t interval on the scenes' mean differences, once enough scenes changed for it to hold. Where fewer than six changed, the rates of
-    cells that gained and that lost the event get their own intervals (`logit_t_bounds`), which are joined by the method of variance
-    estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008): wide, and never without width.
+    The rates of cells that gained and that lost the event get their own intervals (`logit_t_bounds`), which are joined by the method of
+    variance estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008).
 
     Args:
         gained: ``(..., G)`` share of a scene's cells in which only the renderer has the event.
         lost: ``(..., G)`` share in which only the baseline has it.
     """
-    low, high = t_bounds(gained - lost)
-    few = np.sum((gained > 0) | (lost > 0), axis=-1) < LEAST_DECIDED_FLAGS
-    if not np.any(few):
-        return low, high
     up, down = gained.mean(axis=-1), lost.mean(axis=-1)
     (up_low, up_high), (down_low, down_high) = logit_t_bounds(gained), logit_t_bounds(lost)
-    joined_low = np.maximum(up - down - np.hypot(up - up_low, down_high - down), -1.0)
-    joined_high = np.minimum(up - down + np.hypot(up_high - up, down - down_low), 1.0)
-    return np.asarray(np.where(few, joined_low, low)), np.asarray(np.where(few, joined_high, high))
+    low = np.maximum(up - down - np.hypot(up - up_low, down_high - down), -1.0)
+    high = np.minimum(up - down + np.hypot(up_high - up, down - down_low), 1.0)
+    return np.asarray(low), np.asarray(high)
+
+
+def reach_of(metric: MetricInfo, margin: float) -> float:
+    """Return how much worse a scene can be, in the metric's unit; 0 where nothing says so.
+
+    Where differences have no bounds it is `REACH` times the metric's own margin, or the given one where it has none.
+    """
+    most = max(metric.difference_range)
+    return float(most) if np.isfinite(most) else REACH * (metric.accepted or margin)
 
 
 class _Pairs:

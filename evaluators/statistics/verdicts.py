@@ -11,7 +11,8 @@ import numpy as np
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from alpasim_plugin.core.types import F64, Direction
-from evaluators.statistics.intervals import TAIL
+from evaluators.statistics.bounded import scenes_to_exclude
+from evaluators.statistics.intervals import TAIL, are_alike, scaled
 
 Cause = Literal["pass", "regression", "policy", "undecided", "infrastructure", "evaluator"]
 
@@ -84,7 +85,8 @@ Verdict = Literal["non-inferior", "worse", "undecided"]
 Difference = Literal["better", "worse", "none shown"]
 
 ALPHA = 0.05
-ROUNDING = 1e-12  # differences that vary by no more than this, relative, are equal
+LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
+REACH = 40.0  # margins: a scene's difference in a quantity without bounds counts up to so much; beyond, it is an event's matter
 
 
 def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
@@ -92,25 +94,30 @@ def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
     return (bounds[0], bounds[1]) if direction == "lower" else (-bounds[1], -bounds[0])
 
 
-def verdict(bounds: list[float] | None, p: float | None, margin: float, direction: Direction) -> Verdict:
+def verdict(
+    bounds: list[float] | None, p: float | None, margin: float, direction: Direction, guarded: list[float] | None = None
+) -> Verdict:
     """Judge a difference by its 95 % interval.
 
-    Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is more than ``margin`` worse, and the test
-    of no difference rejects too (p < 0.05). Undecided: neither. So each of the two claims is wrong in at most 2.5 % of runs, and more data
-    decides. A metric without a better side needs a margin, and a change to either side counts as worse (wrong in at most 5 %).
+    Non-inferior: the whole interval is better than ``margin`` worse, and so are the guarded bounds. Worse: the whole interval is more than
+    ``margin`` worse, and the test of no difference rejects too (p < 0.05). Undecided: neither. So non-inferior is wrong in at most 2.5 % of
+    runs, also where a few scenes go very wrong and none was drawn (docs/experiments/verdicts.md). A metric without a better side needs a
+    margin, and a change to either side counts as worse.
 
     Args:
         bounds: [low, high] of renderer minus baseline, or None.
         p: Of the test of no difference; None where there is none.
         margin: How much worse is accepted, in the metric's unit, at least 0.
         direction: The better side of the metric.
+        guarded: [low, high] that hold whatever was not drawn (`evaluators.statistics.bounded`); None: ``bounds`` do.
     """
     if bounds is None or (direction == "none" and margin == 0.0):
         return "undecided"
     low, high = harm(bounds, direction)
+    most = max(high, harm(guarded or bounds, direction)[1])
     if direction == "none":
-        low, high = (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(abs(low), abs(high))  # how far from zero
-    if high < margin or (margin == 0.0 and high == low == 0.0):
+        low, most = (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(map(abs, (*bounds, *(guarded or bounds))))
+    if most < margin:
         return "non-inferior"
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
 
@@ -140,8 +147,8 @@ def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
     Flags, and differences that are all alike (where t has no spread to go by), take the exact two-sided sign test on the scenes that
     changed; other metrics the paired t test.
     """
-    alike = float(np.ptp(means)) <= ROUNDING * float(np.max(np.abs(means)))
-    if is_flag or alike:
+    means, _ = scaled(means)
+    if is_flag or are_alike(means):
         return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
     t = float(np.mean(means) / (np.std(means, ddof=1) / np.sqrt(len(means))))
     return 2.0 * float(scipy.special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
@@ -149,7 +156,6 @@ def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
 
 POWER = 0.8
 MOST_SCENES = 100_000  # beyond, this suite cannot decide it
-LEAST_DECIDED_FLAGS = 6  # fewer changed scenes cannot reach p < 0.05 in the two-sided sign test
 
 
 def scenes_needed(distance: float, spread: float, power: float = POWER, tail: float = TAIL) -> int | None:
@@ -183,22 +189,24 @@ def scenes_needed(distance: float, spread: float, power: float = POWER, tail: fl
     return low
 
 
-def scenes_without_event(margin: float) -> int | None:
-    """Return how many scenes without a single changed outcome show a rate difference below the margin (exact bound).
+def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
+    """Return how many scenes without a single difference show that the mean is not worse by the margin (exact bound).
+
+    Args:
+        margin: How much worse is accepted.
+        reach: The most that a scene can be worse.
 
     Example:
-        >>> scenes_without_event(0.05)
-        72
+        >>> scenes_without_event(0.05), scenes_without_event(0.1, 4.0)
+        (72, 146)
     """
-    if margin <= 0.0:
+    if margin <= 0.0 or margin / reach < 1.0 / MOST_SCENES:
         return None
-    if margin >= 1.0:
-        return 2
-    n = math.log(TAIL) / math.log1p(-margin)
-    return max(2, math.ceil(n)) if n <= MOST_SCENES else None
+    found = scenes_to_exclude(margin, reach)
+    return found if found <= MOST_SCENES else None
 
 
-def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_flag: bool) -> int | None:
+def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, reach: float | None) -> int | None:
     """Return about how many more scenes would decide an undecided verdict with 80 % probability, if what was seen is true.
 
     Args:
@@ -206,17 +214,16 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_fla
         spread: Standard deviation of the difference between scenes.
         n_scenes: Scenes so far.
         margin: As for the verdict.
-        is_flag: The metric is a rate.
+        reach: The most that a scene can be worse; None where nothing is known of it.
 
     Returns:
         At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be needed.
     """
-    needed = scenes_without_event(margin) if is_flag and spread == 0.0 and harm == 0.0 else scenes_needed(abs(harm - margin), spread)
-    if needed is None:
-        return None
-    if spread == 0.0 and harm > margin:
-        needed = max(needed, LEAST_DECIDED_FLAGS)
-    return max(1, needed - n_scenes)
+    needed = scenes_needed(abs(harm - margin), spread)
+    if needed is not None and harm < margin and reach is not None:  # as many again as show that nothing was missed
+        unseen = scenes_without_event(margin - harm, reach - harm)
+        needed = None if unseen is None else max(needed, unseen)
+    return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
 
 
 def _decides(n: int, distance: float, spread: float, power: float, tail: float) -> bool:

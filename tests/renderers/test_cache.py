@@ -77,12 +77,6 @@ def test_folder_that_cannot_be_written_names_the_variable(tmp_path: Path, monkey
         cached("texts", "k", lambda folder: None, read, "a text")
 
 
-def test_without_the_variable_it_is_in_the_home_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("SIMRUN_CACHE")
-    monkeypatch.setenv("HOME", "/home/somebody")
-    assert cache_root() == Path("/home/somebody/.cache/simrun")
-
-
 def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache: Path) -> None:
     script = textwrap.dedent(
         """

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.io.atomic import temporary_path
 from alpasim_plugin.runtime.executors.assignment import measured_folder, scratch_root, sweep
 
@@ -36,13 +37,18 @@ def test_only_what_gone_processes_of_this_machine_have_left_is_removed(tmp_path:
     assert of_another.exists()
 
 
-def test_measurements_are_shared_in_a_folder_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measurements_and_scratch_are_in_a_folder_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SIMRUN_SCRATCH", str(tmp_path))
-    assert measured_folder("run") == scratch_root() / "measured" / "run"
-    assert scratch_root().stat().st_mode & 0o777 == 0o700
-    scratch_root().chmod(0o777)
+    monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
+    folder = measured_folder("run")
+    assert folder is not None
+    for made in (scratch_root(), folder.parent):
+        assert made.stat().st_mode & 0o777 == 0o700
+        made.chmod(0o777)
     assert measured_folder("run") is None, "others may write there"
-    scratch_root().rename(tmp_path / "elsewhere")
+    with pytest.raises(InfrastructureError, match="another user could write it"):
+        scratch_root()
+    made.rename(tmp_path / "elsewhere")
     (tmp_path / "elsewhere").chmod(0o700)
-    scratch_root().symlink_to(tmp_path / "elsewhere")
+    made.symlink_to(tmp_path / "elsewhere")
     assert measured_folder("run") is None, "a link, which whoever made it can turn"

@@ -16,6 +16,7 @@ from tests.runtime.test_decide import plan_of
 
 def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("SIMRUN_SCRATCH", str(tmp_path))
+    monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "cache"))
     plan = plan_of(scenes=1)
     try:
         for run in ("first", "second"):

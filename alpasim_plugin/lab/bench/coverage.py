@@ -158,7 +158,7 @@ def _advice(correlation: float, runs: int = 400) -> F64:
     delta = (worse - base).mean(axis=2)
     low, high = t_bounds(delta)
     undecided = delta[(low <= 0) & (high >= 0)]
-    said = [more_scenes(float(d.mean()), float(d.std(ddof=1)), PAPER_SCENES, 0.0, True) for d in undecided]
+    said = [more_scenes(float(d.mean()), float(d.std(ddof=1)), PAPER_SCENES, 0.0, 1.0) for d in undecided]
     return np.array([np.inf if s is None else float(s) for s in said])
 
 

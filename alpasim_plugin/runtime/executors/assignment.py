@@ -10,7 +10,6 @@ import importlib.util
 import os
 import socket
 import stat
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from pydantic import BaseModel
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.processes import is_running
+from alpasim_plugin.io import places
 from alpasim_plugin.io.atomic import disk_error, write_bytes
 from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.plugins.parts import PartSpec
@@ -237,24 +237,27 @@ def with_paths(settings: M, moved: dict[str, str]) -> M:
 
 
 def scratch_root() -> Path:
-    """Return where this node drives: a folder of the user and machine below ``$SIMRUN_SCRATCH``, or the system's temporary one."""
-    return Path(os.environ.get("SIMRUN_SCRATCH") or tempfile.gettempdir(), f"simrun-{os.getuid()}-{socket.gethostname()}")
+    """Return where this node drives (`alpasim_plugin.io.places.scratch`).
+
+    Raises:
+        InfrastructureError: No folder can be written, or another user could write this one.
+    """
+    found = places.scratch()
+    if found.path is None or not places.is_private(found.path):
+        reason = "no folder can be written" if found.path is None else "it cannot be made, or another user could write it"
+        raise InfrastructureError("choosing a scratch folder", str(found), reason, f"name a folder in {places.SCRATCH}")
+    return found.path
 
 
 def measured_folder(run: str) -> Path | None:
     """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.measured`).
 
-    None: nowhere, since `scratch_root` cannot be made, belongs to another user, or others may write there. Its name can be guessed, so
-    whoever was there first could decide what this run takes for its machine's speed.
+    None: nowhere, since the cache cannot be written, or another user could write there and decide what this run takes for its machine's
+    speed.
     """
-    root = scratch_root()
-    try:
-        root.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = root.lstat()
-    except OSError:
-        return None
-    is_private = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o022
-    return root / "measured" / run if is_private else None
+    kept = places.cache().path
+    root = None if kept is None else kept / "measured" / socket.gethostname()
+    return root / run if root is not None and places.is_private(root) else None
 
 
 def sweep(pids: Sequence[int] = ()) -> None:
@@ -265,8 +268,11 @@ def sweep(pids: Sequence[int] = ()) -> None:
     until_s = time.monotonic() + GONE_S
     while any(is_running(pid) for pid in pids) and time.monotonic() < until_s:
         time.sleep(0.05)
-    if scratch_root().is_dir():
-        remove_left_overs(scratch_root())
+    try:
+        root = scratch_root()
+    except InfrastructureError:  # where nothing can be driven, nothing was left
+        return
+    remove_left_overs(root)
 
 
 def private_folder(path: Path, doing: str) -> Path:

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.processes import is_running, started_of
+from alpasim_plugin.io import places
 from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.process.subprocesses import safe_path
 from alpasim_plugin.runtime.executors.assignment import Assignment, private_folder, sweep
@@ -193,13 +194,12 @@ class SlurmBackend(Backend[J]):
 def sessions_folder(run: Path) -> Path:
     """Return the folder of a run's sessions: outside of it, private to this user, and on a file system that all nodes see.
 
-    It is below ``$SIMRUN_SLURM``, or ``simrun/slurm`` of the user's state folder (``$XDG_STATE_HOME``, ``~/.local/state``).
+    It is below `alpasim_plugin.io.places.state`.
 
     Raises:
         InfrastructureError: Another user could write there, or it cannot be made.
     """
-    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
-    base = private_folder(Path(os.environ.get("SIMRUN_SLURM") or Path(state, "simrun", "slurm")), DOING)
+    base = private_folder(places.state(), DOING)
     return private_folder(base / hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:16], DOING)
 
 

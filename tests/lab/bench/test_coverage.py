@@ -96,18 +96,19 @@ def test_the_planned_number_of_scenes_decides_in_four_of_five_runs():
 
 def test_more_scenes_counts_from_what_there_is():
     total = scenes_needed(0.3, 1.0)
-    assert more_scenes(0.4, 1.0, 20, 0.1, is_flag=False) == total - 20
-    assert more_scenes(-0.2, 1.0, 20, 0.1, is_flag=False) == total - 20  # the same way to the margin, from the other side
-    assert more_scenes(0.4, 1.0, total + 5, 0.1, is_flag=False) == 1
-    assert more_scenes(0.1, 1.0, 20, 0.1, is_flag=False) is None  # on the margin
+    assert more_scenes(0.4, 1.0, 20, 0.1, None) == total - 20
+    assert more_scenes(-0.2, 1.0, 20, 0.1, None) == total - 20  # the same way to the margin, from the other side
+    assert more_scenes(0.4, 1.0, total + 5, 0.1, None) == 1
+    assert more_scenes(0.1, 1.0, 20, 0.1, None) is None  # on the margin
+    assert more_scenes(0.0, 0.01, 20, 0.1, 4.0) == 126, "as many as show that no scene went wrong by 4 m"
 
 
 def test_without_any_event_the_exact_bound_says_how_many_scenes_are_needed():
     assert scenes_without_event(0.05) == 72
     assert scenes_without_event(1e-300) is None  # more scenes than a float can count
     assert 1 - 0.025 ** (1 / 72) < 0.05 < 1 - 0.025 ** (1 / 71)
-    assert more_scenes(0.0, 0.0, 20, 0.05, is_flag=True) == 52
-    assert more_scenes(0.0, 0.0, 20, 0.0, is_flag=True) is None
+    assert more_scenes(0.0, 0.0, 20, 0.05, 1.0) == 52
+    assert more_scenes(0.0, 0.0, 20, 0.0, 1.0) is None
 
 
 def test_tables_go_between_their_markers_only(tmp_path: Path):
