@@ -23,6 +23,7 @@ from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
 from alpasim_plugin.drives.points import triangulated
 from alpasim_plugin.drives.quality import measure, write_page
 from alpasim_plugin.drives.road_points import road_points
+from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
@@ -86,7 +87,12 @@ def import_drive(
         InfrastructureError: The disk refuses.
     """
     tell = report or (lambda stage, done, all: None)
-    drive = checked(read_source(folder), folder)
+    found = out.with_name(f".{out.name}.poses")
+    try:
+        drive = checked(read_source(folder, found, tell), folder)
+    except InputError:
+        forget(found)
+        raise
     key = _key(drive, camera_height_m, lane_map)
     if out.exists():
         return _finished(out, key)
@@ -105,15 +111,16 @@ def import_drive(
     model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id, work / FIT_FOLDER, tell)
     model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
     roads = corridor(placed.ego, placed.ground)
-    obstacles = standing_obstacles(model.background, placed.ground, placed.ego)
+    standing = standing_obstacles(model.background, placed.points, placed.ground, placed.ego, Vehicle())
     log = _log(drive, placed, roads, scene_id)
     _write_transforms(work, shown, exposures)
-    write_drive(work, log, placed.tracks, obstacles)
-    measured = measure(model, views, placed, obstacles, tell)
+    write_drive(work, log, placed.tracks, standing.obstacles)
+    measured = measure(model, views, placed, standing, tell)
     quality = write_page(work, drive, placed, measured)
     write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, folder))
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     work.replace(out)
+    forget(found)
     return quality
 
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.colmap import model_folder, read_colmap
 from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
+from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
 from alpasim_plugin.gaussians.sh import C0
@@ -21,8 +23,13 @@ PAIRS, FEWEST, CLEARLY = 6, 40, 1.5  # pairs that the axes are tried on; matches
 FORMS = "transforms.json, a KITTI odometry folder, a DGP scene, a COLMAP model, a video, or a folder of photographs"
 
 
-def read_source(folder: Path) -> SourceDrive:
+def read_source(folder: Path, work: Path, tell: Report) -> SourceDrive:
     """Read a recorded drive.
+
+    Args:
+        folder: A folder, or a video.
+        work: Receives what structure from motion finds; only made where there are no poses.
+        tell: Called as the work goes on.
 
     Raises:
         InputError: There is nothing, no reader knows it, or it is damaged.
@@ -35,6 +42,10 @@ def read_source(folder: Path) -> SourceDrive:
         return read_kitti(folder)
     if folder.is_dir() and is_dgp(folder):
         return read_dgp(folder)
+    if folder.is_dir() and model_folder(folder) is not None:
+        return read_colmap(folder)
+    if is_unposed(folder):
+        return read_unposed(folder, work, tell)
     inside = ", ".join(sorted(path.name for path in folder.iterdir())[:5]) if folder.is_dir() else "a file"
     raise InputError(DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
 
