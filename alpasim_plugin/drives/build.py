@@ -88,15 +88,24 @@ def import_drive(
     """
     tell = report or (lambda stage, done, all: None)
     found = out.with_name(f".{out.name}.poses")
+    work = out.with_name(f".{out.name}.unfinished")
     try:
         drive = checked(read_source(folder, found, tell), folder)
-    except InputError:
+        key = _key(drive, camera_height_m, lane_map)
+        if out.exists():
+            return _finished(out, key)
+        quality = _built(drive, folder, work, key, camera_height_m, tell)
+    except InputError:  # it would be the same again: nothing is kept to go on from
         forget(found)
+        forget(work)
         raise
-    key = _key(drive, camera_height_m, lane_map)
-    if out.exists():
-        return _finished(out, key)
-    work = out.with_name(f".{out.name}.unfinished")
+    work.replace(out)
+    forget(found)
+    return quality
+
+
+def _built(drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, tell: Report) -> dict[str, Any]:
+    """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
@@ -119,8 +128,6 @@ def import_drive(
     quality = write_page(work, drive, placed, measured)
     write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, folder))
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
-    work.replace(out)
-    forget(found)
     return quality
 
 
