@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
@@ -24,12 +25,11 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.builder import placed_cloud
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import C0
-from alpasim_plugin.renderers.background import coverage_of
 
 DOING = "importing a trained model"
 OPAQUE, MOST_POINTS = 0.3, 100_000  # Gaussians that count as surface; how many of them the ground is looked for in
 SPREAD = 0.5  # of a Gaussian's middle around the surface, in its own mean size
-LEAST_COVERED = 0.5  # share of the path with Gaussians near it
+LEAST_CARRIED, NEAR_M, FEWEST = 0.5, 2.5, 5  # share of the way that must have so many points so near below it
 
 
 def import_splat(file: Path, poses: Path, out: Path, report: Report | None = None) -> dict[str, Any]:
@@ -87,13 +87,9 @@ def _built(
     assert drive.points is not None
     placed = place(drive, drive.points)
     background = placed_cloud(cloud, placed.T_world_source)
-    coverage = coverage_of(background, placed.ego.xyz)
-    if placed.strip is None or coverage.covered < LEAST_COVERED:
-        found = (
-            "no ground of the model lies below the way of the poses"
-            if placed.strip is None
-            else f"{100 * coverage.covered:.0f} % of the way of the poses lies near Gaussians of the model ({coverage})"
-        )
+    share = 0.0 if placed.strip is None else _carried(placed)
+    if share < LEAST_CARRIED:
+        found = f"{100 * share:.0f} % of the way of the poses runs over Gaussians of the model"
         raise InputError(DOING, str(file), found, "give the poses in the model's own frame and unit: those that it was trained with")
     model = Reconstruction(background, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
     begin(work, key)
@@ -104,6 +100,13 @@ def _built(
         views["fitted"] = _blank(drive, placed)
     drive = replace(drive, notes=(*drive.notes, _said(has_photographs), "the sky is black: a model of Gaussians has none"))
     return write_folder(work, drive, placed, model, shown, views, {}, tell)
+
+
+def _carried(placed: PlacedDrive) -> float:
+    """Return the share of the way that has surface below it."""
+    tree = scipy.spatial.KDTree(placed.points.xyz)
+    near = tree.query_ball_point(placed.ego.xyz, NEAR_M, return_length=True)
+    return float(np.mean(np.asarray(near) >= FEWEST))
 
 
 def _said(has_photographs: bool) -> str:
