@@ -51,13 +51,14 @@ def model_folder(folder: Path) -> Path | None:
     return next((one for one in places if any((one / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None)
 
 
-def read_colmap(folder: Path, pictures_at: Path | None = None, kind: str = "colmap") -> SourceDrive:
+def read_colmap(folder: Path, pictures_at: Path | None = None, kind: str = "colmap", photographs: bool = True) -> SourceDrive:
     """Read a model. Pictures in folders of their own are cameras of their own; they are taken in the order of their names.
 
     Args:
         folder: Holds the model, here or in ``sparse/0``.
         pictures_at: Folder of the pictures; None looks for ``images``.
         kind: What it is called.
+        photographs: Whether they must be there.
 
     Raises:
         InputError: A file is missing, damaged or of a lens that OpenCV does not have; or there are no pictures.
@@ -74,7 +75,7 @@ def read_colmap(folder: Path, pictures_at: Path | None = None, kind: str = "colm
         xyz, rgb = _points_bin(data["points3D"]) if binary else _points_txt(data["points3D"])
     if not images:
         raise InputError(DOING, str(model), "no image with a pose", DO_THIS)
-    root = pictures_at or _pictures_root(folder, model, images[0].name)
+    root = pictures_at or _pictures_root(folder, model, images[0].name, photographs)
     shots = [
         Picture(
             root / one.name, cameras[one.camera], inverse(one.T_camera_world), f"{model}, image {one.name}", None, _camera(one.name), {}
@@ -96,11 +97,13 @@ def _camera(name: str) -> str:
     return "front" if folder == "." else folder.replace("/", "-")
 
 
-def _pictures_root(folder: Path, model: Path, name: str) -> Path:
+def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     for base in (folder, model):
         for place in PICTURES:
             if (base / place / name).is_file():
                 return base / place
+    if not needed:
+        return folder / PICTURES[0]
     raise InputError(DOING, str(folder), f"no picture {name}", "put the pictures into a folder 'images' beside the model")
 
 

@@ -109,8 +109,8 @@ class SourceDrive:
         return np.array([picture.T_world_camera[:3, 3] for picture in self.of(self.front)])
 
 
-def checked(drive: SourceDrive, folder: Path) -> SourceDrive:
-    """Return a drive whose photographs are whole and whose poses can be those of a moving camera.
+def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> SourceDrive:
+    """Return a drive whose poses can be those of a moving camera, and, if ``photographs`` are needed, whose photographs are whole.
 
     Raises:
         InputError: A photograph is cut off, or of another size than its lens or its camera's others; too few; two units of length in one
@@ -118,7 +118,8 @@ def checked(drive: SourceDrive, folder: Path) -> SourceDrive:
     """
     pictures = drive.of(drive.front)
     for one in drive.pictures:
-        whole_photograph(one.file, one.lens, one.where)
+        if photographs:
+            whole_photograph(one.file, one.lens, one.where)
         first = drive.of(str(one.camera))[0].lens
         if (one.lens.width, one.lens.height) != (first.width, first.height):
             found = f"{one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}"
