@@ -12,22 +12,22 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
-from alpasim_plugin.drives.correcting import with_corrected_poses
-from alpasim_plugin.drives.fitting import fitted
+from alpasim_plugin.core.types import F64, Box, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
-from alpasim_plugin.drives.points import triangulated
+from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
-from alpasim_plugin.drives.road_points import road_points
 from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
+from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.io.reading import read_bytes, read_json
@@ -38,6 +38,7 @@ SCENARIO_FILE, KEY_FILE, FIT_FOLDER, POINTS_FILE = "scenario.yaml", "import.json
 EVERY = 8  # one photograph of so many is held out
 FIT_PX = 608  # least width of fitted views; half of the photograph's where that is more
 RENDER_PX, SIDE_PX = 640, 16  # most width of the scenario's cameras; what their sides are multiples of, as fixers need
+SEED = 0  # of the fit
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
 Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
 
@@ -280,3 +281,41 @@ def _scenario_text(scene_id: str, log: RecordedLog, name: str) -> str:
         f"# A recorded drive, imported from {name}; quality.md says how good it is.\n"
         f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
     )
+
+
+def fitted(
+    views: Sequence[PosedView],
+    kept: Sequence[PosedView],
+    points: Points,
+    boxes: Mapping[str, Box],
+    scene_id: str,
+    folder: Path,
+    tell: Report,
+) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
+    """Fit a model to views.
+
+    Args:
+        views: To fit to.
+        kept: Held out, to measure with on the way.
+        points: To start from.
+        boxes: Sizes of the road users that views may show.
+        scene_id: Key of the random streams.
+        folder: Keeps the fit's state; the same call goes on from it.
+        tell: Called as the fit goes on.
+
+    Returns:
+        The model, and the exposure of each view by its name.
+    """
+    torch.set_num_threads(1)
+    near = points.chosen(np.asarray(points.spread < np.percentile(points.spread, 90)))
+    start = cloud_from_points(near.xyz, near.rgb)
+    done = fit_drive(
+        views, start, kept=kept, boxes=boxes, scene_id=scene_id, folder=folder, seed=SEED,
+        report=lambda stage, at, all, numbers: tell(_words(stage, numbers), at, all),
+    )  # fmt: skip
+    return done.model, dict(done.exposures)
+
+
+def _words(stage: str, numbers: Mapping[str, float]) -> str:
+    """Return a stage with how well held-out photographs are shown, where that was just measured."""
+    return f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB" if "held_out_db" in numbers else stage
