@@ -236,6 +236,7 @@ def read_drive(folder: Path) -> RecordedLog:
         notes=tuple(document["notes"]),
         recording=_recording(files, folder),
         model=str(model),
+        standing="unknown" if document["obstacles"] is None else "found",
     )
 
 

@@ -124,6 +124,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
         varied=drawn.varied,
         recording=drive.recording,
         model=drive.model,
+        standing=drive.standing,
         stop_at_path_end=timing.stop_at_path_end,
     )
 

@@ -8,7 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, HeightField, LaneMap, Photograph, Route, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    Actor,
+    Box,
+    CameraSpec,
+    HeightField,
+    LaneMap,
+    Photograph,
+    Route,
+    Standing,
+    Trajectory,
+    Vehicle,
+)
 from scenarios.reading import SourceFiles
 
 
@@ -36,6 +49,7 @@ class RecordedLog:
     route: Route | None = None  # None: the recorded path, carried on along the lanes
     recording: tuple[Photograph, ...] = ()  # see `Scenario.recording`
     model: str | None = None  # see `Scenario.model`
+    standing: Standing = "known"
 
 
 MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors

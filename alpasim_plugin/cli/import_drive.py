@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from alpasim_plugin.cli.options import Json, command_of
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.drives.build import import_drive
+from alpasim_plugin.drives.splat import import_splat
 from alpasim_plugin.process.signals import Stopped
 
 LINE_EVERY_S = 10.0
@@ -27,6 +28,9 @@ Examples:
 
 - `simrun import drive walk.mp4 -o walk --camera-height 1.4`: a video without poses (needs the extra `sfm`)
 """
+SPLAT_EPILOG = (
+    "Example: `simrun import splat street.ply --poses transforms.json -o street`: then `simrun --renderer 3dgs street/scenario.yaml`"
+)
 
 app = typer.Typer(no_args_is_help=True, help="Make a scenario of a recorded drive, or of a trained model.")
 
@@ -49,14 +53,32 @@ def drive(
         except Stopped as stop:
             stop.kept = "the same command goes on where it stopped"
             raise
+    _finish(quality, out, began, as_json)
+
+
+def splat(
+    file: Annotated[Path, Positional("The model: .ply, compressed .ply, .splat, .spz, .sog, or a folder of SOG.", metavar="FILE")],
+    poses: Annotated[Path, Flag("How it was driven through, in its own frame: transforms.json, COLMAP model, KITTI folder.")],
+    out: Out,
+    as_json: Json = False,
+) -> None:
+    """Make a scenario of a trained model of Gaussians and the poses of a drive through it."""
+    began = time.perf_counter()
+    with _progress(as_json) as tell:
+        quality = import_splat(file, poses, out, tell)
+    _finish(quality, out, began, as_json)
+
+
+app.command("drive", epilog=DRIVE_EPILOG)(command_of(drive))
+app.command("splat", epilog=SPLAT_EPILOG)(command_of(splat))
+
+
+def _finish(quality: Mapping[str, Any], out: Path, began: float, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"scenario": str(out / "scenario.yaml"), "seconds": round(time.perf_counter() - began, 1), **quality}))
         return
     for line in _told(quality, out):
         print(line)
-
-
-app.command("drive", epilog=DRIVE_EPILOG)(command_of(drive))
 
 
 def _told(quality: Mapping[str, Any], out: Path) -> Iterator[str]:

@@ -270,6 +270,9 @@ class BackgroundFile:
     keep_road: bool = False  # whether the built road is drawn with it
 
 
+Standing = Literal["known", "found", "unknown"]  # what stands there: all among the actors; found in a reconstruction; not looked for
+
+
 @dataclass(frozen=True)
 class Scene:
     """What evaluators may see of a scenario: the map and the human drive, never pixels."""
@@ -279,6 +282,7 @@ class Scene:
     ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
     vehicle: Vehicle
     alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+    standing: Standing = "known"
 
 
 @dataclass(frozen=True)
@@ -311,12 +315,13 @@ class Scenario:
     varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # key of the scenario file -> (as written, as drawn by the seed)
     recording: tuple[Photograph, ...] = ()  # the drive's photographs, of an imported drive
     model: str | None = None  # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and `clean` is refused
+    standing: Standing = "known"
     stop_at_path_end: bool = True  # a rollout ends where the recorded path does, unless the recorded car stands there
 
     @property
     def scene(self) -> Scene:
         """Give the part that evaluators may see."""
-        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle, self.alpasim_map)
+        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle, self.alpasim_map, self.standing)
 
 
 # --- log and scores -------------------------------------------------------------------------------------------------

@@ -12,20 +12,22 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
-from alpasim_plugin.drives.correcting import with_corrected_poses
-from alpasim_plugin.drives.fitting import fitted
+from alpasim_plugin.core.types import F64, Box, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
-from alpasim_plugin.drives.points import triangulated
+from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
-from alpasim_plugin.drives.road_points import road_points
+from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
+from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.io.reading import read_bytes, read_json
@@ -36,6 +38,7 @@ SCENARIO_FILE, KEY_FILE, FIT_FOLDER, POINTS_FILE = "scenario.yaml", "import.json
 EVERY = 8  # one photograph of so many is held out
 FIT_PX = 608  # least width of fitted views; half of the photograph's where that is more
 RENDER_PX, SIDE_PX = 640, 16  # most width of the scenario's cameras; what their sides are multiples of, as fixers need
+SEED = 0  # of the fit
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
 Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
 
@@ -86,48 +89,87 @@ def import_drive(
         InfrastructureError: The disk refuses.
     """
     tell = report or (lambda stage, done, all: None)
-    drive = checked(read_source(folder), folder)
-    key = _key(drive, camera_height_m, lane_map)
-    if out.exists():
-        return _finished(out, key)
+    found = out.with_name(f".{out.name}.poses")
     work = out.with_name(f".{out.name}.unfinished")
+    try:
+        drive = checked(read_source(folder, found, tell), folder)
+        key = key_of(drive, camera_height_m, lane_map)
+        if out.exists():
+            return finished(out, key)
+        quality = _built(drive, folder, work, key, camera_height_m, tell)
+    except InputError:  # it would be the same again: nothing is kept to go on from
+        forget(found)
+        forget(work)
+        raise
+    work.replace(out)
+    forget(found)
+    return quality
+
+
+def _built(drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, tell: Report) -> dict[str, Any]:
+    """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
-    shown = _shown(drive, placed)
-    _begin(work, key)
-    _write_photographs(work, shown, tell)
-    _write_points(work, placed)
+    shown = shown_photographs(drive, placed)
+    begin(work, key)
+    write_photographs(work, shown, tell)
     views = {use: [one.view() for one in shown if one.use == use] for use in ("fitted", "held-out", "never-fitted")}
     boxes = {actor.actor_id: actor.box for actor in placed.tracks}
-    scene_id = _scene_id(drive)
-    model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id, work / FIT_FOLDER, tell)
-    model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
-    roads = corridor(placed.ego, placed.ground)
-    obstacles = standing_obstacles(model.background, placed.ground, placed.ego)
-    log = _log(drive, placed, roads, scene_id)
-    _write_transforms(work, shown, exposures)
-    write_drive(work, log, placed.tracks, obstacles)
-    measured = measure(model, views, placed, obstacles, tell)
-    quality = write_page(work, drive, placed, measured)
-    write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, folder))
+    model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id_of(drive), work / FIT_FOLDER, tell)
+    quality = write_folder(work, drive, placed, model, shown, views, exposures, tell)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
-    work.replace(out)
     return quality
 
 
-def _key(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
+def write_folder(
+    work: Path,
+    drive: SourceDrive,
+    placed: PlacedDrive,
+    model: Reconstruction,
+    shown: Sequence[Shown],
+    views: Mapping[str, Sequence[PosedView]],
+    exposures: Mapping[str, tuple[float, float, float]],
+    tell: Report,
+) -> dict[str, Any]:
+    """Find what stands in a model, measure it, and write everything of an imported drive but its photographs.
+
+    Args:
+        work: The folder.
+        drive, placed: The recording, as read and in the world.
+        model: Its reconstruction.
+        shown: The photographs, which lie in the folder.
+        views: Use of the photographs to them as views; of the fitted ones only the cameras matter.
+        exposures: Of each fitted view by its name.
+        tell: Called as the work goes on.
+
+    Returns:
+        What ``quality.json`` holds.
+    """
+    scene_id = scene_id_of(drive)
+    model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
+    standing = standing_obstacles(model.background, placed.points, placed.ground, placed.ego, Vehicle())
+    log = _log(drive, placed, corridor(placed.ego, placed.ground), scene_id)
+    write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
+    _write_transforms(work, shown, exposures)
+    write_drive(work, log, placed.tracks, standing.obstacles)
+    quality = write_page(work, drive, placed, measure(model, views, placed, standing, tell))
+    write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, drive.scene_id))
+    return quality
+
+
+def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
     """Return what identifies an import: the pictures by size and time of change, their poses and lenses, and the options."""
     digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and lane_map.read_bytes())).encode())
     for one in drive.pictures:
-        status = one.file.stat()
-        digest.update(f"{one.file}{status.st_size}{status.st_mtime_ns}{one.camera}{one.t_us}".encode())
+        status = one.file.stat() if one.file.is_file() else None
+        digest.update(f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode())
         digest.update(one.T_world_camera.tobytes() + one.lens.K.tobytes() + one.lens.distortion.tobytes())
     return digest.hexdigest()
 
 
-def _finished(out: Path, key: str) -> dict[str, Any]:
+def finished(out: Path, key: str) -> dict[str, Any]:
     """Return the quality of a finished import, or refuse another thing in its place."""
     if not (out / SCENARIO_FILE).is_file() or not (out / KEY_FILE).is_file():
         raise InputError(DOING, str(out), "it exists and is no imported drive", "name a folder that does not exist yet")
@@ -137,7 +179,7 @@ def _finished(out: Path, key: str) -> dict[str, Any]:
     return quality
 
 
-def _begin(work: Path, key: str) -> None:
+def begin(work: Path, key: str) -> None:
     """Make the working folder, or keep that of the same import; another one's is removed."""
     if work.exists() and (not (work / KEY_FILE).is_file() or json.loads((work / KEY_FILE).read_text()).get("key") != key):
         shutil.rmtree(work)
@@ -160,7 +202,7 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     return points.joined(road_points(front, rough.poses[drive.front], rough.strip).moved(np.linalg.inv(T)))
 
 
-def _shown(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
+def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
     """Return all photographs with their names, uses and places."""
     first_us = int(placed.ego.t_us[0])
     out = []
@@ -175,7 +217,7 @@ def _shown(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
     return out
 
 
-def _write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
+def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
     """Write the photographs without distortion; those that have none are copied as they are."""
     for i, one in enumerate(shown):
         path = work / one.file
@@ -186,10 +228,6 @@ def _write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None
         bends = one.picture.lens.bends
         data = cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes() if bends else read_bytes(one.picture.file, DOING)
         write_bytes(path, data, DOING)
-
-
-def _write_points(work: Path, placed: PlacedDrive) -> None:
-    write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
 
 
 def _write_transforms(work: Path, shown: Sequence[Shown], exposures: Mapping[str, tuple[float, float, float]]) -> None:
@@ -228,17 +266,56 @@ def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
     return CameraSpec(name if name != drive.front or "front" in name else "front", width, height, K, placed.mounts[name])
 
 
-def _scene_id(drive: SourceDrive) -> str:
+def scene_id_of(drive: SourceDrive) -> str:
+    """Return a name that a scenario may have."""
     letters = "".join(c if c.isalnum() or c in "_.-" else "-" for c in drive.scene_id).strip("-_.")
     return letters[:80] or "drive"
 
 
-def _scenario_text(scene_id: str, log: RecordedLog, folder: Path) -> str:
+def _scenario_text(scene_id: str, log: RecordedLog, name: str) -> str:
     length_us = int(log.ego_log.t_us[-1])
     timing = ""
     if length_us < SHORT_US:
         timing = "timing: {start_us: 0, warmup_us: 0}  # a short recording: driven from its first pose on\n"
     return (
-        f"# A recorded drive, imported from {folder.resolve().name}; quality.md says how good it is.\n"
+        f"# A recorded drive, imported from {name}; quality.md says how good it is.\n"
         f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
     )
+
+
+def fitted(
+    views: Sequence[PosedView],
+    kept: Sequence[PosedView],
+    points: Points,
+    boxes: Mapping[str, Box],
+    scene_id: str,
+    folder: Path,
+    tell: Report,
+) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
+    """Fit a model to views.
+
+    Args:
+        views: To fit to.
+        kept: Held out, to measure with on the way.
+        points: To start from.
+        boxes: Sizes of the road users that views may show.
+        scene_id: Key of the random streams.
+        folder: Keeps the fit's state; the same call goes on from it.
+        tell: Called as the fit goes on.
+
+    Returns:
+        The model, and the exposure of each view by its name.
+    """
+    torch.set_num_threads(1)
+    near = points.chosen(np.asarray(points.spread < np.percentile(points.spread, 90)))
+    start = cloud_from_points(near.xyz, near.rgb)
+    done = fit_drive(
+        views, start, kept=kept, boxes=boxes, scene_id=scene_id, folder=folder, seed=SEED,
+        report=lambda stage, at, all, numbers: tell(_words(stage, numbers), at, all),
+    )  # fmt: skip
+    return done.model, dict(done.exposures)
+
+
+def _words(stage: str, numbers: Mapping[str, float]) -> str:
+    """Return a stage with how well held-out photographs are shown, where that was just measured."""
+    return f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB" if "held_out_db" in numbers else stage

@@ -1,14 +1,131 @@
-"""Standing obstacles of a reconstruction."""
+"""What stands in a reconstruction and can be hit: upright boxes around opaque Gaussians between 0.3 and 2 m above the ground.
+
+A splat has no bodies: without these a car drives through a parked one and nothing is measured. What the recorded car drove through is free
+by that fact; opaque Gaussians there are errors of the fit, are left out, and are counted.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
-from alpasim_plugin.core.types import HeightField, Trajectory
+import numpy as np
+import scipy
+
+from alpasim_plugin.core.geometry import matrix_from_quat
+from alpasim_plugin.core.types import F64, Bool, Box, HeightField, Trajectory, Vehicle
+from alpasim_plugin.drives.ground import PathFrame
+from alpasim_plugin.drives.source import Points
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from scenarios.drive import Obstacle
+from alpasim_plugin.world.ground import height_at
+from scenarios.drive import OBSTACLE, Obstacle
+
+LOW_M, HIGH_M = 0.3, 2.0  # above the ground: below is kerb and grass, above a car passes
+OPAQUE, LARGEST_M = 0.3, 0.6  # of a Gaussian that counts; larger ones are background, or blur
+CELL_M, PIECE_M, REACH_M = 0.2, 1.0, 9.0  # of the grid, of a box along the path, and from the path
+LEAST_M2 = 0.06  # of opaque surface in a column of a cell: a wall has 0.34
+FEWEST = 3  # cells of something that stands
+SPARE_M = 0.1  # beside the recorded car that it drove through unhurt
+UNSEEN_M = 0.5  # uncertainty where no point is near
+NEAR_M = 1.0
 
 
-def standing_obstacles(cloud: GaussianCloud, ground: HeightField, ego: Trajectory) -> Sequence[Obstacle] | None:
-    """Return what stands beside the path."""
-    return None
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Obstacles, and how many cells of the driven path were opaque by mistake."""
+
+    obstacles: tuple[Obstacle, ...]
+    cleared: int
+
+
+def standing_obstacles(cloud: GaussianCloud, points: Points, ground: HeightField, ego: Trajectory, vehicle: Vehicle) -> Standing:
+    """Return what stands beside a driven path.
+
+    Args:
+        cloud: The reconstruction's background, world.
+        points: Triangulated or measured points, world; their spread near an obstacle is its uncertainty.
+        ground: Height field.
+        ego: Recorded rig poses.
+        vehicle: The recorded car, which hit nothing.
+    """
+    places, area = _samples(cloud)
+    frame = PathFrame(ego.xyz, 1.0)
+    s, left, _ = frame.place(places)
+    above = places[:, 2] - height_at(ground, places)
+    near = (above > LOW_M) & (above < HIGH_M) & (np.abs(left) < REACH_M) & (s > frame.s[0]) & (s < frame.s[-1])
+    places, area, above = places[near], area[near], above[near]
+    low = ego.xyz[:, :2].min(axis=0) - REACH_M - 30.0
+    cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64)
+    if not len(cells):
+        return Standing((), 0)
+    grid = np.zeros(cells.max(axis=0) + 3)
+    np.add.at(grid, (cells[:, 0] + 1, cells[:, 1] + 1), area)
+    occupied = grid > LEAST_M2
+    driven = _driven(occupied, low, ego, vehicle)
+    cleared = int((occupied & driven).sum())
+    occupied &= ~driven
+    label, _ = scipy.ndimage.label(occupied, structure=np.ones((3, 3)))
+    sizes = np.bincount(label.ravel())
+    sizes[0] = 0
+    kept = np.argwhere((sizes >= FEWEST)[label] & occupied)
+    at = low + (kept - 0.5) * CELL_M  # the cells' middles: the grid has a border of one cell
+    tops = _tops(places, above, low, grid.shape)[kept[:, 0], kept[:, 1]]
+    return Standing(tuple(_boxes(at, label[kept[:, 0], kept[:, 1]], tops, frame, ground, points)), cleared)
+
+
+def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
+    """Return points ``(N, 3)`` on the opaque Gaussians, their middles and their ends, and the surface ``(N,)`` that each stands for."""
+    scales = np.asarray(cloud.scales, dtype=np.float64)
+    chosen = (np.asarray(cloud.opacities) > OPAQUE) & (scales.max(axis=1) < LARGEST_M)
+    means, scales = np.asarray(cloud.means, dtype=np.float64)[chosen], scales[chosen]
+    order = np.argsort(-scales, axis=1)[:, :2]
+    axes = np.take_along_axis(matrix_from_quat(np.asarray(cloud.quats, dtype=np.float64)[chosen]), order[:, None, :], axis=2)  # (N, 3, 2)
+    sizes = np.take_along_axis(scales, order, axis=1)
+    ends = axes * sizes[:, None, :]
+    shown = [means, means + ends[:, :, 0], means - ends[:, :, 0], means + ends[:, :, 1], means - ends[:, :, 1]]
+    surface = np.pi * sizes[:, 0] * sizes[:, 1] * np.asarray(cloud.opacities, dtype=np.float64)[chosen] / len(shown)
+    return np.concatenate(shown), np.tile(surface, len(shown))
+
+
+def _driven(grid: Bool, low: F64, ego: Trajectory, vehicle: Vehicle) -> Bool:
+    """Return which cells the recorded car drove over."""
+    x, y = np.meshgrid(np.arange(grid.shape[0]) - 0.5, np.arange(grid.shape[1]) - 0.5, indexing="ij")
+    xy = low + np.column_stack([x.ravel(), y.ravel()]) * CELL_M
+    frame = PathFrame(ego.xyz, 1.0)
+    s, left, _ = frame.place(xy)
+    begins, ends = -1.0, frame.s[-1] + frame.s[0] + vehicle.box.length_m
+    inside = (np.abs(left) < vehicle.box.width_m / 2 + SPARE_M) & (s > begins) & (s < ends)
+    return np.asarray(inside.reshape(grid.shape))
+
+
+def _tops(places: F64, above: F64, low: F64, shape: tuple[int, ...]) -> F64:
+    tops = np.zeros(shape)
+    cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64) + 1
+    np.maximum.at(tops, (cells[:, 0], cells[:, 1]), above)
+    return tops
+
+
+def _boxes(at: F64, label: F64, tops: F64, frame: PathFrame, ground: HeightField, points: Points) -> list[Obstacle]:
+    """Return boxes around pieces of connected cells, along the path's own direction."""
+    s, left, _ = frame.place(at)
+    piece = np.floor(s / PIECE_M).astype(np.int64)
+    tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
+    out = []
+    for one in np.unique(np.stack([label, piece, left > 0], axis=1).astype(np.int64), axis=0):
+        mine = (label == one[0]) & (piece == one[1]) & ((left > 0) == bool(one[2]))
+        k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))
+        along = frame.along[k]
+        across = np.array([-along[1], along[0]])
+        u, v = at[mine] @ along, at[mine] @ across
+        half = CELL_M / 2
+        middle = along * (u.max() + u.min()) / 2 + across * (v.max() + v.min()) / 2
+        top = float(tops[mine].max())
+        base = float(height_at(ground, middle[None])[0])
+        spread = UNSEEN_M
+        if tree is not None:
+            close = tree.query_ball_point(middle, NEAR_M + float(np.ptp(v)) / 2)
+            spread = float(np.median(points.spread[close])) if close else UNSEEN_M
+        uncertainty = round(float(np.hypot(CELL_M / 2, spread)), 2)
+        box = Box(float(np.ptp(u)) + 2 * half, float(np.ptp(v)) + 2 * half, top)
+        name = f"{OBSTACLE}{len(out) + 1:03d}-within-{uncertainty:g}m"
+        out.append(Obstacle(name, box, np.array([*middle, base + top / 2]), float(np.arctan2(along[1], along[0])), uncertainty))
+    return out

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.colmap import model_folder, read_colmap
 from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
+from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
 from alpasim_plugin.gaussians.sh import C0
@@ -21,8 +23,14 @@ PAIRS, FEWEST, CLEARLY = 6, 40, 1.5  # pairs that the axes are tried on; matches
 FORMS = "transforms.json, a KITTI odometry folder, a DGP scene, a COLMAP model, a video, or a folder of photographs"
 
 
-def read_source(folder: Path) -> SourceDrive:
+def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True) -> SourceDrive:
     """Read a recorded drive.
+
+    Args:
+        folder: A folder, or a video.
+        work: Receives what structure from motion finds; only made where there are no poses.
+        tell: Called as the work goes on.
+        photographs: Whether they must be there; poses and lenses alone are enough for a model that is trained already.
 
     Raises:
         InputError: There is nothing, no reader knows it, or it is damaged.
@@ -30,16 +38,20 @@ def read_source(folder: Path) -> SourceDrive:
     if not folder.exists():
         raise InputError(DOING, str(folder), "it does not exist", f"give {FORMS}")
     if folder.is_dir() and (folder / FILE).is_file():
-        return _transforms(folder)
+        return _transforms(folder, photographs)
     if folder.is_dir() and is_kitti(folder):
         return read_kitti(folder)
     if folder.is_dir() and is_dgp(folder):
         return read_dgp(folder)
+    if folder.is_dir() and model_folder(folder) is not None:
+        return read_colmap(folder, photographs=photographs)
+    if is_unposed(folder):
+        return read_unposed(folder, work, tell)
     inside = ", ".join(sorted(path.name for path in folder.iterdir())[:5]) if folder.is_dir() else "a file"
     raise InputError(DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
 
 
-def _transforms(folder: Path) -> SourceDrive:
+def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     """Read a ``transforms.json`` of either convention of axes."""
     document = read_json_object(folder / FILE, DOING)
     notes = []
@@ -49,7 +61,8 @@ def _transforms(folder: Path) -> SourceDrive:
         axes, note = recognised_axes(folder)
         notes.append(note)
     _, listed = read_pictures(folder, axes)
-    there, missing = present(folder, listed)
+    some = photographs or any(one.file.is_file() for one in listed)
+    there, missing = present(folder, listed) if some else (listed, ())
     if missing:
         notes.append(f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {', '.join(missing[:4])}...")
     names = list(dict.fromkeys(one.camera or "front" for one in there))

@@ -12,6 +12,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare
@@ -37,17 +38,17 @@ class Measured:
         rows: Use of the photographs to their comparisons.
         coverage: Metres beside the path to the share of the lower half of the picture that the model covers.
         plan: ``(H, W, 3)`` uint8, the drive from above.
-        obstacles: Standing obstacles; None where they were not looked for.
+        standing: Obstacles.
     """
 
     rows: Mapping[str, Sequence[Comparison]]
     coverage: Mapping[float, float]
     plan: U8
-    obstacles: Sequence[Obstacle] | None
+    standing: Standing
 
 
 def measure(
-    model: Reconstruction, views: Mapping[str, Sequence[PosedView]], placed: PlacedDrive, obstacles: Sequence[Obstacle] | None, tell: Report
+    model: Reconstruction, views: Mapping[str, Sequence[PosedView]], placed: PlacedDrive, standing: Standing, tell: Report
 ) -> Measured:
     """Render the model where photographs were taken that it did not see, and beside the path."""
     graph = model.graph()
@@ -59,7 +60,7 @@ def measure(
             rows[use] = compare(graph, chosen)
     some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
     coverage = {aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M}
-    return Measured(rows, coverage, _plan(placed, obstacles), obstacles)
+    return Measured(rows, coverage, _plan(placed, standing.obstacles), standing)
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -76,7 +77,7 @@ def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
     return float((alpha[camera.height // 2 :] > OPAQUE).mean())
 
 
-def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle] | None) -> U8:
+def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle]) -> U8:
     """Draw points, path and obstacles from above, the drive's heading to the right."""
     path = placed.ego.xyz[:, :2]
     low, high = path.min(axis=0) - 15.0, path.max(axis=0) + 15.0
@@ -94,7 +95,7 @@ def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle] | None) -> U8:
     inside = ((cells >= 0) & (cells < size)).all(axis=1)
     image[cells[inside, 1], cells[inside, 0]] = np.rint(placed.points.rgb[order][inside] * 200).astype(np.uint8)
     cv2.polylines(image, [np.rint(at(path)).astype(np.int32)], False, (30, 90, 220), 2, cv2.LINE_AA)
-    for one in obstacles or ():
+    for one in obstacles:
         c, s, half = np.cos(one.yaw_rad), np.sin(one.yaw_rad), np.array([one.box.length_m, one.box.width_m]) / 2
         corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half @ np.array([[c, s], [-s, c]]) + one.xyz[:2]
         cv2.polylines(image, [np.rint(at(corners)).astype(np.int32)], True, (200, 40, 30), 2, cv2.LINE_AA)
@@ -116,13 +117,20 @@ def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: 
         "photographs": {use: len(rows) for use, rows in measured.rows.items()},
         **{use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")} for use, rows in measured.rows.items()},
         "coverage": [{"aside_m": aside, "share": round(share, 4)} for aside, share in measured.coverage.items()],
-        "obstacles": None if measured.obstacles is None else len(measured.obstacles),
+        "obstacles": _obstacle_facts(measured.standing),
         **placed.facts,
         "notes": [*drive.notes, *placed.notes],
     }
     write_json(folder / "quality.json", quality)
     write_text(folder / "quality.md", _page(drive, quality, shown))
     return quality
+
+
+def _obstacle_facts(standing: Standing) -> dict[str, Any]:
+    spread = [one.uncertainty_m for one in standing.obstacles]
+    return {
+        "boxes": len(spread), "uncertainty_m": round(float(np.median(spread)), 2) if spread else None, "cleared_cells": standing.cleared,
+    }  # fmt: skip
 
 
 def _mean(rows: Sequence[Comparison], name: str) -> float:
@@ -150,8 +158,12 @@ def _page(drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[
             "",
             f"Ground: {ground['points']} points, camera {ground['camera_height_m']:.2f} m above it; against them by section: {errors}.",
         ]
-    number = quality["obstacles"]
-    lines += ["", "Standing obstacles: " + ("not looked for; contact with them is not measured." if number is None else f"{number}.")]
+    found = quality["obstacles"]
+    lines += [
+        "",
+        f"Standing obstacles: {found['boxes']} boxes, whose sides are known to {found['uncertainty_m']} m (median). Of the path that was",
+    ]
+    lines += [f"driven, {found['cleared_cells']} cells of 0.2 m were opaque by mistake and were taken as free."]
     lines += ["", "## From above", "", f"![from above]({PICTURES}/plan.png)", "", "## Photograph above, reconstruction below"]
     for use, row, name in shown:
         lines += ["", f"{use}, {row.name}: {row.psnr_db:.2f} dB", "", f"![{row.name}]({name})"]

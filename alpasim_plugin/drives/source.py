@@ -10,7 +10,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Actor, Trajectory
-from alpasim_plugin.gaussians.fit.photographs import Picture
+from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
 DOING = "importing a drive"
 JUMP = 12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
@@ -109,13 +109,21 @@ class SourceDrive:
         return np.array([picture.T_world_camera[:3, 3] for picture in self.of(self.front)])
 
 
-def checked(drive: SourceDrive, folder: Path) -> SourceDrive:
-    """Return a drive whose poses can be those of a moving camera.
+def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> SourceDrive:
+    """Return a drive whose poses can be those of a moving camera, and, if ``photographs`` are needed, whose photographs are whole.
 
     Raises:
-        InputError: Too few photographs, two lengths of unit in one file, a camera that stands or only turns.
+        InputError: A photograph is cut off, or of another size than its lens or its camera's others; too few; two units of length in one
+            file; a camera that stands or only turns.
     """
     pictures = drive.of(drive.front)
+    for one in drive.pictures:
+        if photographs:
+            whole_photograph(one.file, one.lens, one.where)
+        first = drive.of(str(one.camera))[0].lens
+        if (one.lens.width, one.lens.height) != (first.width, first.height):
+            found = f"{one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}"
+            raise InputError(DOING, f"{one.where}, {one.file}", found, "give the photographs as they were, each with its camera's name")
     if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
         found = f"{len(pictures)} photographs of the camera {drive.front!r}"
         raise InputError(DOING, str(folder), found, f"give at least {FEWEST} photographs with poses along a drive")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.contact import FRONT, LATERAL, REAR, SweptContacts, find_contacts, find_swept, last_per_step
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
@@ -20,6 +20,8 @@ from evaluators.metrics.score import handover_us, series, with_preset
 
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 NO_CONTACT = "nothing touches the ego"
+STANDING = "obstacle-"  # ids of what stands in a reconstruction and was found there; the id also says how exactly
+NOT_LOOKED_FOR = "standing obstacles were not looked for: no contact with a tracked road user does not mean no contact"
 
 
 @dataclass(frozen=True)
@@ -66,32 +68,49 @@ def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tupl
 
 
 def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*`` where motion is searched too."""
+    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*`` where motion is searched too.
+
+    In a recorded drive whose standing obstacles were found in its reconstruction, contact with them is also reported apart; where they were
+    not looked for, only contact is known, not its absence.
+    """
     origin = origin_of(rollout.ego, preset)
     t_us = rollout.ego.t_us
     ego, actors = ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin)
     contacts, gap_m = find_contacts(ego, actors, t_us)
     if preset.hits == "last":
         contacts = last_per_step(contacts, ego, actors, t_us)
-    step, side = contacts.step, contacts.side
+    step, side, actor = contacts.step, contacts.side, contacts.actor
     first: list[MetricSeries] = []
     if preset.contact == "between_steps":
         swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
-        step, side, first = swept.step, swept.side, _first_contacts(rollout, swept)
+        step, side, actor, first = swept.step, swept.side, swept.actor, _first_contacts(rollout, swept)
         gap_m[step] = 0.0
     touched = np.zeros((3, len(t_us)), dtype=np.bool_)
     touched[side, step] = True
     front, rear, lateral = touched[FRONT], touched[REAR], touched[LATERAL]
     there = np.isfinite(gap_m)
+
+    def flag(name: str, fired: Bool) -> MetricSeries:
+        return series(name, t_us, fired, fired | (scene.standing != "unknown"), NOT_LOOKED_FOR)
+
+    gap_known, why = (there, "no other actor is present") if scene.standing != "unknown" else (there & (gap_m == 0), NOT_LOOKED_FOR)
     return [
-        series("collision_any", t_us, front | rear | lateral),
-        *([] if preset.hits == "last" else [series("collision_at_fault", t_us, front | lateral)]),
-        series("collision_front", t_us, front),
-        series("collision_lateral", t_us, lateral),
-        series("collision_rear", t_us, rear),
-        series("min_distance_to_obstacle_m", t_us, gap_m, there, "no other actor is present", keep_values=not preset.honour_valid),
+        flag("collision_any", front | rear | lateral),
+        *([] if preset.hits == "last" else [flag("collision_at_fault", front | lateral)]),
+        flag("collision_front", front),
+        flag("collision_lateral", lateral),
+        flag("collision_rear", rear),
+        *([flag("collision_standing", _standing(actors, actor, step, len(t_us)))] if scene.standing != "known" else []),
+        series("min_distance_to_obstacle_m", t_us, gap_m, gap_known, why, keep_values=not preset.honour_valid),
         *first,
     ]
+
+
+def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
+    """Return at which steps something touches the ego that was found standing in a reconstruction."""
+    touched = np.zeros(count, dtype=np.bool_)
+    touched[[k for k, one in zip(step, actor, strict=True) if actors.ids[one].startswith(STANDING)]] = True
+    return touched
 
 
 def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSeries]:

@@ -174,6 +174,7 @@ def _min_ade(horizon: float | str, target: str) -> MetricInfo:
 FOOTPRINT, CENTRE = "footprint, plan view", "box centre, plan view"
 UNKNOWN = MetricInfo("", "none", "last", "")
 _SIGNED = (None, None)
+_NOT_LOOKED_FOR = "nothing is touched in a recorded drive whose standing obstacles were not looked for"
 _NO_LANES, _NO_CONTACT, _SHORT = "no lanes", "steps without contact", "`P` is shorter than 1 m"
 _UNCOVERED, _NO_IMAGE, _EITHER = "the recording does not cover `t`", "no image", "unknown unless one fired"
 _BEGAN = "where on `F` the contact that touches now began; `strict` only"
@@ -181,21 +182,28 @@ _BEGAN = "where on `F` the contact that touches now began; `strict` only"
 METRICS = MetricTable({  # in the order in which reports show them, after the headline ones
     "collision_at_fault": _flag(
         "front or lateral contact", is_headline=True, label="at-fault collisions", reference=FOOTPRINT,
-        formula="`collision_front` or `collision_lateral`",
+        formula="`collision_front` or `collision_lateral`", invalid=_NOT_LOOKED_FOR,
     ),
     "collision_any": _flag(
         "any contact with another actor", is_headline=True, label="collisions", reference=FOOTPRINT, formula="front, rear or lateral",
+        invalid=_NOT_LOOKED_FOR,
     ),
     "collision_front": _flag(
         "an actor touches the front bumper", reference=FOOTPRINT, formula="an actor's rectangle touches `F` and its front side",
+        invalid=_NOT_LOOKED_FOR,
     ),
     "collision_lateral": _flag(
         "an actor touches the ego at neither bumper", reference=FOOTPRINT,
-        formula="an actor's rectangle touches `F` and neither its front nor its rear side",
+        formula="an actor's rectangle touches `F` and neither its front nor its rear side", invalid=_NOT_LOOKED_FOR,
     ),
     "collision_rear": _flag(
         "an actor touches the rear bumper and not the front one", reference=FOOTPRINT,
-        formula="an actor's rectangle touches `F` and its rear side, not its front side",
+        formula="an actor's rectangle touches `F` and its rear side, not its front side", invalid=_NOT_LOOKED_FOR,
+    ),
+    "collision_standing": _flag(
+        "the ego touches something that stands in the reconstruction of a recorded drive", reference=FOOTPRINT,
+        formula="`F` touches the box of a standing obstacle, whose name says how exactly it is known; recorded drives only",
+        invalid=_NOT_LOOKED_FOR,
     ),
     "min_distance_to_obstacle_m": _metres(
         "least plan-view gap between the ego and any actor", "higher", "min", margin=0.25, curve=3, reference=FOOTPRINT,

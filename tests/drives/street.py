@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+from alpasim_plugin.core.geometry import quat_from_matrix
 
 WIDTH, HEIGHT, FOCAL = 320, 128, 180.0
 CAMERA_M, STEP_M, COUNT = 1.5, 0.6, 24
@@ -134,4 +137,34 @@ def write_kitti(folder: Path, street: Street | None = None, spare_pictures: int 
     right = P.copy()
     right[0, 3] = -FOCAL * base
     (folder / "calib.txt").write_text("\n".join(" ".join(f"{v:.12e}" for v in one.ravel()) for one in (P, right)))
+    return folder
+
+
+def write_colmap(folder: Path, binary: bool, model: str = "SIMPLE_PINHOLE", bend: tuple[float, ...] = ()) -> Path:
+    """Write the street as a COLMAP model in ``sparse/0`` with pictures in ``images``; the unit is arbitrary."""
+    street, sparse = Street(), folder / "sparse/0"
+    sparse.mkdir(parents=True)
+    (folder / "images").mkdir()
+    number = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}[model]
+    focal = (FOCAL,) if model.startswith("SIMPLE") else (FOCAL, FOCAL)
+    p = (*focal, K[0, 2], K[1, 2], *bend)
+    coefficients = np.array([*bend, 0, 0, 0, 0][:4], dtype=float) if bend else None
+    rows = []
+    for i, x in enumerate(stations()):
+        T = street.pose(x)
+        cv2.imwrite(str(folder / f"images/{i:03d}.png"), street.photograph(T, coefficients, model == "OPENCV_FISHEYE"))
+        back = np.linalg.inv(T)
+        rows.append((i + 1, *quat_from_matrix(back[:3, :3]), *(0.5 * back[:3, 3]), 1, f"{i:03d}.png"))
+    places = np.array([[x, y, float(street.ground(np.array(x)))] for x in np.arange(2.0, 25.0, 0.5) for y in np.arange(-2.0, 2.1, 0.5)])
+    if binary:
+        images = b"".join(struct.pack("<i7di", *row[:9]) + row[9].encode() + b"\0" + struct.pack("<Qddq", 1, 1.0, 2.0, -1) for row in rows)
+        points = b"".join(struct.pack("<Q3d3BdQii", i, *(0.5 * q), 90, 90, 90, 0.5, 1, 1, 0) for i, q in enumerate(places))
+        camera = struct.pack("<iiQQ", 1, number, WIDTH, HEIGHT) + struct.pack(f"<{len(p)}d", *p)
+        for name, count, body in (("cameras", 1, camera), ("images", len(rows), images), ("points3D", len(places), points)):
+            (sparse / f"{name}.bin").write_bytes(struct.pack("<Q", count) + body)
+    else:
+        (sparse / "cameras.txt").write_text(f"# cameras\n1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, p))}\n")
+        (sparse / "images.txt").write_text("# images\n" + "".join(" ".join(map(str, row)) + "\n1.0 2.0 -1\n" for row in rows))
+        text = "".join(f"{i} {0.5 * q[0]} {0.5 * q[1]} {0.5 * q[2]} 90 90 90 0.5 1 0\n" for i, q in enumerate(places))
+        (sparse / "points3D.txt").write_text("# points\n" + text)
     return folder

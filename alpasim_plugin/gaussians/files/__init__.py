@@ -8,10 +8,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianArrays, GaussianCloud, build_cloud
 from alpasim_plugin.gaussians.files.packed import is_compressed_ply, read_compressed_ply, read_splat, read_spz
 from alpasim_plugin.gaussians.files.ply import read_ply_arrays, read_ply_header
+from alpasim_plugin.gaussians.files.sog import is_sog, read_sog
 from alpasim_plugin.io.reading.files import open_regular, parsing
 
 DOING = "reading a Gaussian model"
-SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz")
+SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz", ".sog (also as a folder with meta.json)")
 
 
 def read_gaussians(path: Path | str, element: str | None = None) -> tuple[GaussianCloud, CleanReport]:
@@ -21,7 +22,7 @@ def read_gaussians(path: Path | str, element: str | None = None) -> tuple[Gaussi
     axes of a PLY, so the same model lies in the same place in every form.
 
     Args:
-        path: PLY, compressed PLY, ``.splat`` or ``.spz`` file.
+        path: PLY, compressed PLY, ``.splat`` or ``.spz`` file; SOG as ``.sog`` or as its folder.
         element: For a PLY with several models, the one to read.
 
     Returns:
@@ -38,6 +39,8 @@ def read_gaussians(path: Path | str, element: str | None = None) -> tuple[Gaussi
 
 
 def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
+    if is_sog(path):
+        return read_sog(path)
     head = _first_bytes(path)
     if head[:3] == b"ply":
         compressed = is_compressed_ply(read_ply_header(path))
@@ -50,7 +53,7 @@ def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
         "reading a Gaussian model",
         str(path),
         f"suffix {path.suffix!r} with first bytes {head!r}",
-        f"give one of {', '.join(SUPPORTED)}; SOG and training checkpoints must be converted first",
+        f"give one of {', '.join(SUPPORTED)}; training checkpoints must be converted first",
     )
 
 

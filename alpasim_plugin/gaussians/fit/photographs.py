@@ -340,8 +340,8 @@ def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     return path
 
 
-def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_COLOR) -> U8:
-    """Read a photograph as it is, BGR or grey, after checking that it is whole and what its lens says.
+def whole_photograph(path: Path, lens: Lens, where: str) -> bytes:
+    """Return a photograph's file after checking that it is whole and what its lens says, without decoding it.
 
     Raises:
         InputError: The file is missing, cut off, of another size, too large, or not in grey or RGB.
@@ -355,6 +355,13 @@ def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_C
     fault = picture_fault(data)
     if fault:
         raise InputError(DOING, f"{where}, {path}", fault, "give a whole PNG or JPEG in grey or RGB")
+    return data
+
+
+def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_COLOR) -> U8:
+    """Read a photograph as it is, BGR or grey; see `whole_photograph`."""
+    data = whole_photograph(path, lens, where)
+    do = "give a whole PNG or JPEG in grey or RGB"
     return np.asarray(decode_image(data, f"{where}, {path}", DOING, do, flag | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
 
 

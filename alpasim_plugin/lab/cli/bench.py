@@ -8,7 +8,16 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.lab.bench.raster import bench_raster
-from alpasim_plugin.lab.cli import bench_evaluators, bench_executors, bench_fixer, bench_presets, bench_profile, bench_roofline, bench_serve
+from alpasim_plugin.lab.cli import (
+    bench_evaluators,
+    bench_executors,
+    bench_fixer,
+    bench_presets,
+    bench_profile,
+    bench_real,
+    bench_roofline,
+    bench_serve,
+)
 from alpasim_plugin.lab.cli.bench_paper import EPILOG as PAPER_EXAMPLES
 from alpasim_plugin.lab.cli.bench_paper import paper
 from alpasim_plugin.lab.cli.bench_rows import print_rows
@@ -28,6 +37,7 @@ app.command("executors", epilog=bench_executors.EPILOG)(bench_executors.executor
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
 app.command("profile", epilog=bench_profile.EPILOG)(bench_profile.profiles)
+app.command("real", epilog=bench_real.EPILOG)(bench_real.real)
 app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
 app.command("serve", epilog=bench_serve.EPILOG)(bench_serve.serve)
 app.command("quality", epilog=QUALITY_EXAMPLES)(quality)

@@ -1,0 +1,148 @@
+"""Read SOG (PlayCanvas, version 2): ``meta.json`` and lossless WebP planes, in a folder or zipped as ``.sog``.
+
+One pixel a Gaussian, row by row. Places are 16 bits an axis on a logarithmic scale; rotations leave out their largest component; scales and
+colours are entries of codebooks of 256; higher harmonics are shared by palette. Axes are those of a PLY.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from typing_extensions import TypedDict
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.gaussians.cloud import GaussianArrays
+from alpasim_plugin.io.limits import GAUSSIANS, PICTURE_PIXELS, SOURCE_BYTES
+from alpasim_plugin.io.reading import parse_json, read_bytes
+from alpasim_plugin.io.reading.files import as_shape, parsing
+
+DOING = "reading a SOG model"
+META = "meta.json"
+DO_THIS = "write it again as SOG of version 2 (splat-transform), or give the PLY"
+BANDS = {1: 3, 2: 8, 3: 15}  # of harmonics above the constant one to coefficients
+PALETTE_WIDTH = 64  # palette entries a row of the centroids' plane
+_LARGEST = ((1, 2, 3, 0), (0, 2, 3, 1), (0, 1, 3, 2), (0, 1, 2, 3))  # where the three stored components and the largest go, wxyz
+Get = Callable[[str], bytes]
+
+
+class _Plane(TypedDict):
+    codebook: list[float]
+    files: list[str]
+
+
+class _Means(TypedDict):
+    mins: list[float]
+    maxs: list[float]
+    files: list[str]
+
+
+class _Files(TypedDict):
+    files: list[str]
+
+
+class _Meta(TypedDict):
+    version: int
+    count: int
+    means: _Means
+    scales: _Plane
+    quats: _Files
+    sh0: _Plane
+
+
+def is_sog(path: Path) -> bool:
+    """Return whether a path is a folder with SOG's ``meta.json``, that file, or a zip."""
+    return (path.is_dir() and (path / META).is_file()) or path.name == META or path.suffix.lower() == ".sog"
+
+
+def read_sog(path: Path) -> GaussianArrays:
+    """Read a model.
+
+    Raises:
+        InputError: A plane is missing, damaged or too small; or another version.
+    """
+    if path.is_dir() or path.name == META:
+        folder = path if path.is_dir() else path.parent
+        return _read(lambda name: read_bytes(folder / Path(name).name, DOING, SOURCE_BYTES), folder / META)
+    data = read_bytes(path, DOING, SOURCE_BYTES)
+    with parsing(DOING, path, DO_THIS, "a damaged zip"), zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = {Path(info.filename).name: info for info in archive.infolist() if info.file_size <= SOURCE_BYTES.high}
+        return _read(lambda name: archive.read(names[name]), path)
+
+
+def _read(get: Get, where: Path) -> GaussianArrays:
+    document = parse_json(get(META), where, DOING)
+    meta = as_shape(_Meta, document, where, DOING, DO_THIS)
+    if meta["version"] != 2:
+        raise InputError(DOING, str(where), f"version {meta['version']}", DO_THIS)
+    n = meta["count"]
+    GAUSSIANS.check(n, DOING, where)
+
+    def plane(name: str, least: int) -> U8:
+        pixels = _plane(get(name), f"{where}, {name}").reshape(-1, 4)
+        if len(pixels) < least:
+            raise InputError(DOING, f"{where}, {name}", f"{len(pixels)} pixels for {least} values", DO_THIS)
+        return pixels[:least]
+
+    low, high = (plane(name, n)[:, :3].astype(np.float64) for name in meta["means"]["files"])
+    mins, maxs = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    logs = mins + (low + 256 * high) / 65535 * (maxs - mins)
+    means = np.sign(logs) * np.expm1(np.abs(logs))
+    scales = np.exp(np.array(meta["scales"]["codebook"])[plane(meta["scales"]["files"][0], n)[:, :3]])
+    colour = plane(meta["sh0"]["files"][0], n)
+    constant = np.array(meta["sh0"]["codebook"])[colour[:, :3]]
+    rest = _harmonics(document.get("shN"), plane, n) if document.get("shN") else np.zeros((n, 0, 3))
+    sh = np.concatenate([constant[:, None], rest], axis=1)
+    return GaussianArrays(means, _rotations(plane(meta["quats"]["files"][0], n)), scales, colour[:, 3] / 255.0, sh)
+
+
+def _plane(data: bytes, where: str) -> U8:
+    """Return a plane as RGBA ``(H, W, 4)``, after looking at the size that its header claims."""
+    size = _webp_size(data)
+    if size is None:
+        raise InputError(DOING, where, f"{len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS)
+    PICTURE_PIXELS.check(size[0] * size[1], DOING, where)
+    with parsing(DOING, where, DO_THIS, "no readable WebP"):
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3:
+        raise InputError(DOING, where, "a plane that does not decode", DO_THIS)
+    code = cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
+    return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height of a WebP file (RFC 9649, 2.5 to 2.7); None where it is none."""
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+        return None
+    if data[12:16] == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if data[12:16] == b"VP8X":
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
+
+
+def _rotations(pixels: U8) -> F64:
+    three = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
+    largest = np.sqrt(np.maximum(0.0, 1.0 - (three**2).sum(axis=1)))
+    which = np.clip(pixels[:, 3].astype(np.int64) - 252, 0, 3)
+    out = np.empty((len(pixels), 4))
+    np.put_along_axis(out, np.array(_LARGEST)[which], np.column_stack([three, largest]), axis=1)
+    return out
+
+
+def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -> F64:
+    """Return the higher harmonics ``(N, K, 3)``."""
+    count, bands = int(facts["count"]), int(facts["bands"])
+    coefficients, codebook = BANDS[bands], np.array(facts["codebook"], dtype=np.float64)
+    rows = -(-count // PALETTE_WIDTH)
+    centroids = plane(facts["files"][0], rows * PALETTE_WIDTH * coefficients)[:, :3]
+    palette = codebook[centroids].reshape(rows * PALETTE_WIDTH, coefficients, 3)
+    labels = plane(facts["files"][1], n).astype(np.int64)
+    return np.asarray(palette[np.minimum(labels[:, 0] + 256 * labels[:, 1], count - 1)])

@@ -1,0 +1,217 @@
+"""Renderers against the photographs of an imported drive: those held out along its path, and those of a camera that no fit ever saw.
+
+Every photograph of such a camera is rendered in order of time, as the loop would ask for frames, so that a fixer has its history; only
+photographs that the fit did not see are measured. Pictures are compared at the size at which the scenario renders the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.image_metrics import psnr_db, ssim
+from alpasim_plugin.core.types import F64, U8, CameraSpec, Photograph, RenderRequest, Scenario
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
+from alpasim_plugin.lab.bench.lane_paint import PaintCounts, compare_paint, road_of
+from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance, picture_distances
+from alpasim_plugin.lab.video_metrics.warp import warp_l1
+from alpasim_plugin.plugins.interfaces import Renderer
+from alpasim_plugin.renderers.recorded import posed_photograph
+
+DOING = "measuring renderers against photographs"
+SETS = ("held-out", "never-fitted")
+BIN_M = (0.25, 0.75, 1.5, 3.0)  # rows end at these distances from the recorded path
+SIDE_PX = 16  # sides are multiples of this, as fixers need
+METRICS = ("psnr_db", "ssim", "perceptual_syn", "cvvdp_jod", "warp_l1", "paint_precision", "paint_recall")
+Row = dict[str, str | int | float | None]
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A photograph at the size that is measured.
+
+    Attributes:
+        photograph: As the drive has it.
+        camera: Where it was taken from.
+        rgb: ``(H, W, 3)``.
+        distance_m: From the path along which the photographs of the fit were taken.
+    """
+
+    photograph: Photograph
+    camera: PinholeCamera
+    rgb: U8
+    distance_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Judges:
+    """What is asked besides PSNR and SSIM."""
+
+    perceptual: ImageDistance
+    vdp: ColourVideoVDP | None
+
+
+def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
+    """Return the photographs of every camera that has some the fit never saw, in order of time.
+
+    Raises:
+        InputError: The scenario is no imported drive, or its fit saw every photograph.
+    """
+    if scenario.model is None:
+        do = "give a drive that was imported: simrun import drive FOLDER -o OUT"
+        raise InputError(DOING, scenario.scene_id, "no recorded drive: it has no photographs", do)
+    path = np.array([one.T_world_camera[:3, 3] for one in scenario.recording if one.use == "fitted"]).reshape(-1, 3)
+    cameras = sorted({one.camera for one in scenario.recording if one.use in SETS})
+    if not cameras or len(path) < 2:
+        do = "import it again: every eighth photograph is held out where there are eight"
+        raise InputError(DOING, scenario.scene_id, "no photograph that the fit did not see", do)
+    taken = {name: sorted((p for p in scenario.recording if p.camera == name), key=lambda p: p.t_us) for name in cameras}
+    return {name: [_shot(scenario, one, path) for one in photographs] for name, photographs in taken.items()}
+
+
+def _shot(scenario: Scenario, one: Photograph, path: F64) -> Shot:
+    spec = next((camera for camera in scenario.cameras if camera.name == one.camera), scenario.cameras[0])
+    camera, rgb = posed_photograph(one, min(spec.width, one.width) // SIDE_PX * SIDE_PX)
+    kept = max(SIDE_PX, min(spec.height, camera.height) // SIDE_PX * SIDE_PX)
+    top = (camera.height - kept) // 2
+    K = camera.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
+    cut = PinholeCamera(camera.width, kept, K, camera.T_camera_world)
+    return Shot(one, cut, np.ascontiguousarray(rgb[top : top + kept]), _distance(path, one.T_world_camera[:3, 3]))
+
+
+def _distance(path: F64, place: F64) -> float:
+    """Return the distance of a place from a path ``(N, 3)``, metres."""
+    return float(min(_to_segment(a, b, place) for a, b in pairwise(path)))
+
+
+def _to_segment(a: F64, b: F64, place: F64) -> float:
+    along = b - a
+    t = float(np.clip((place - a) @ along / max(float(along @ along), 1e-12), 0.0, 1.0))
+    return float(np.linalg.norm(a + t * along - place))
+
+
+def measure_drive(
+    name: str, scenario: Scenario, renderers: Mapping[str, Callable[[], Renderer]], judges: Judges, report: Report | None = None
+) -> list[Row]:
+    """Return a row for each renderer, camera, set of photographs and distance.
+
+    Args:
+        name: Of the drive, for its rows.
+        scenario: The imported drive.
+        renderers: Name to what makes a session of it; every camera gets its own.
+        judges: Networks.
+        report: Called with renderer and camera, frames done and all.
+    """
+    tell = report or (lambda what, done, all: None)
+    shots = shots_of(scenario)
+    rows = []
+    for renderer, make in renderers.items():
+        for camera, taken in shots.items():
+            made = _rendered(scenario, make(), taken, lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n))  # type: ignore[misc]
+            for use in SETS:
+                rows += _rows(name, renderer, camera, use, scenario, taken, made, judges)
+    return rows
+
+
+def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]) -> list[U8]:
+    """Return a picture for each photograph.
+
+    Raises:
+        InputError: The renderer makes blocks of frames, or needs to know later ones.
+    """
+    if renderer.block is not None or renderer.lookahead:
+        raise InputError(DOING, type(renderer).__name__, "a renderer of blocks of frames", "name renderers that make one frame at a time")
+    frames = []
+    for i, shot in enumerate(taken):
+        frames.append(renderer.render(_request(scenario, shot)).rgb)
+        tell(i + 1)
+    return frames
+
+
+def _request(scenario: Scenario, shot: Shot) -> RenderRequest:
+    one = shot.photograph
+    T_rig_camera = inverse(interpolate(scenario.ego_log, one.t_us)) @ one.T_world_camera
+    spec = CameraSpec(one.camera, shot.camera.width, shot.camera.height, shot.camera.K, T_rig_camera)
+    return RenderRequest(one.t_us, spec, np.stack([one.T_world_camera, one.T_world_camera]), log_actors(scenario, one.t_us))
+
+
+def _rows(
+    drive: str, renderer: str, camera: str, use: str, scenario: Scenario, taken: Sequence[Shot], made: Sequence[U8], judges: Judges
+) -> list[Row]:
+    chosen = [i for i, shot in enumerate(taken) if shot.photograph.use == use]
+    bins = np.searchsorted(BIN_M, [taken[i].distance_m for i in chosen])
+    rows: list[Row] = []
+    for number in np.unique(bins):
+        part = [i for i, b in zip(chosen, bins, strict=True) if b == number]
+        distance = float(np.mean([taken[i].distance_m for i in part]))
+        head: Row = {"drive": drive, "renderer": renderer, "camera": camera, "set": use, "distance_m": round(distance, 3)}
+        rows.append({**head, "n_frames": len(part), **_values(scenario, taken, made, part, judges)})
+    return rows
+
+
+def _values(scenario: Scenario, taken: Sequence[Shot], made: Sequence[U8], part: Sequence[int], judges: Judges) -> Row:
+    truth, shown = np.stack([taken[i].rgb for i in part]), np.stack([made[i] for i in part])
+    pairs = [warp_l1(np.stack([made[i - 1], made[i]]))[0] for i in part if i > 0]
+    paint = PaintCounts()
+    for i in part:
+        road = road_of(taken[i].camera, scenario.ground, scenario.ego_log.xyz)
+        paint += compare_paint(made[i], taken[i].rgb, road)
+    return {
+        "psnr_db": _mean([psnr_db(a, b) for a, b in zip(shown, truth, strict=True)]),
+        "ssim": _mean([ssim(a, b) for a, b in zip(shown, truth, strict=True)]),
+        "perceptual_syn": _mean(picture_distances(judges.perceptual, shown, truth)),
+        "cvvdp_jod": None if judges.vdp is None else _mean(judges.vdp.jod(shown, truth)),
+        "warp_l1": _mean(pairs),
+        "paint_precision": None if paint.precision is None else round(paint.precision, 4),
+        "paint_recall": None if paint.recall is None else round(paint.recall, 4),
+    }
+
+
+def _mean(values: Sequence[float] | F64) -> float | None:
+    return round(float(np.mean(values)), 5) if len(values) else None
+
+
+def intervals(rows: Sequence[Row]) -> list[dict[str, object]]:
+    """Return mean and 95 % interval (Student) over drives of every metric, by renderer and set; none of what one drive alone measured.
+
+    The drives are the sample: frames of one drive are not independent.
+    """
+    out: list[dict[str, object]] = []
+    for renderer, use in dict.fromkeys((row["renderer"], row["set"]) for row in rows):
+        mine = [row for row in rows if (row["renderer"], row["set"]) == (renderer, use)]
+        for metric in METRICS:
+            values = [
+                value
+                for value in (_of_drive(mine, drive, metric) for drive in dict.fromkeys(row["drive"] for row in mine))
+                if value is not None
+            ]
+            if len(values) < 2:
+                continue
+            half = float(scipy.stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
+            middle = float(np.mean(values))
+            out.append(
+                {
+                    "renderer": renderer,
+                    "set": use,
+                    "metric": metric,
+                    "drives": len(values),
+                    "mean": middle,
+                    "ci95": [middle - half, middle + half],
+                }
+            )
+    return out
+
+
+def _of_drive(rows: Sequence[Row], drive: object, metric: str) -> float | None:
+    """Return a drive's mean of a metric over its rows, by their frames; None where no row has it."""
+    found = [(float(row[metric]), float(row["n_frames"])) for row in rows if row["drive"] == drive and row[metric] is not None]  # type: ignore[arg-type]
+    return float(np.average([v for v, _ in found], weights=[n for _, n in found])) if found else None

@@ -1,0 +1,95 @@
+"""``simrun bench real``: renderers and fixers judged by the photographs of imported drives."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
+from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, shots_of
+from alpasim_plugin.lab.cli.bench_rows import print_rows
+from alpasim_plugin.lab.video_metrics.image_distance import load_distance
+from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
+from alpasim_plugin.plugins.interfaces import Renderer
+from alpasim_plugin.renderers import make_renderer
+from scenarios.load import load_scenario
+
+EPILOG = """
+Examples:
+
+- `simrun bench real runs/street --renderer 3dgs,onefixer`
+
+- `simrun bench real runs/street runs/avenue --renderer 3dgs,onefixer --json`: with intervals over the drives
+"""
+EVERY = 10  # frames between lines of progress
+
+
+def real(
+    drives: Annotated[list[Path], typer.Argument(help="Folders of imported drives, or their scenario files.")],
+    renderers: Annotated[str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")] = "3dgs,onefixer",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and to fix.")] = "cpu",
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Compare renderers with photographs that no fit saw: on the recorded path, and beside it with a second camera.
+
+    PSNR, SSIM, perceptual-syn, ColorVideoVDP (where cvvdp is installed), Warp L1, and precision and recall of lane paint.
+    """
+    del debug
+    scenarios = _loaded(drives)
+    for scenario in scenarios.values():
+        shots_of(scenario)  # what cannot be measured is refused before anything is rendered
+    vdp, why_not = load_metric()
+    judges, console = Judges(load_distance(NAME), vdp), Console(stderr=True)
+    if why_not:
+        console.print(why_not, highlight=False)
+    rows: list[Row] = []
+    for name, scenario in scenarios.items():
+        makers = {part: _maker(part, scenario, seed, device, threads) for part in _names(renderers)}
+        rows += measure_drive(name, scenario, makers, judges, partial(_tell, console, name))
+    over = intervals(rows)
+    if len(scenarios) == 1:
+        console.print("one drive: no interval; how these numbers vary from drive to drive is not known", highlight=False)
+    if as_json:
+        print(json.dumps({"rows": rows, **({"intervals": over} if over else {})}))
+        return
+    print_rows(rows, False)
+    if over:
+        print_rows([{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False)  # type: ignore[misc]
+
+
+def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
+    out: dict[str, Scenario] = {}
+    for drive in drives:
+        file = drive / "scenario.yaml" if drive.is_dir() else drive
+        name = file.parent.name
+        if name in out:
+            raise InputError(DOING, str(drive), f"two drives called {name!r}", "name each folder once, and give folders different names")
+        out[name] = load_scenario(str(file))
+    return out
+
+
+def _names(text: str) -> list[str]:
+    names = [part.strip() for part in text.split(",") if part.strip()]
+    if not names or len(set(names)) < len(names):
+        raise InputError(DOING, f"--renderer {text}", "no renderer, or one twice", "write for example 3dgs,onefixer")
+    return names
+
+
+def _maker(name: str, scenario: Scenario, seed: int, device: str, threads: int | None) -> Callable[[], Renderer]:
+    return lambda: make_renderer(name, scenario, seed, device, threads)
+
+
+def _tell(console: Console, drive: str, what: str, done: int, all: int) -> None:
+    if done % EVERY == 0 or done == all:
+        console.print(f"{drive}: {what}: {done}/{all}", highlight=False)

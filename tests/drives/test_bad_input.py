@@ -1,0 +1,186 @@
+"""Recordings that cannot be driven in are refused with what was found and what to do, and nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.build import import_drive
+from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_kitti, write_transforms
+
+Change = Callable[[Path], None]
+
+
+def poses(change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> Change:
+    """Change the poses of a KITTI folder."""
+
+    def apply(folder: Path) -> None:
+        path = folder / "poses.txt"
+        rows = [np.array([float(word) for word in line.split()]).reshape(3, 4) for line in path.read_text().splitlines()]
+        path.write_text("\n".join(" ".join(f"{v:.9e}" for v in row.ravel()) for row in change(rows)))
+
+    return apply
+
+
+def not_a_number(rows: list[np.ndarray]) -> list[np.ndarray]:
+    rows[5][0, 3] = np.nan
+    return rows
+
+
+def left_handed(rows: list[np.ndarray]) -> list[np.ndarray]:
+    rows[7][:, 0] *= -1
+    return rows
+
+
+def sheared(rows: list[np.ndarray]) -> list[np.ndarray]:
+    rows[2][:, 1] *= 1.4
+    return rows
+
+
+def centimetres_from_the_twelfth_on(rows: list[np.ndarray]) -> list[np.ndarray]:
+    start = rows[11][:, 3].copy()
+    for row in rows[12:]:
+        row[:, 3] = start + 100 * (row[:, 3] - start)
+    return rows
+
+
+def standing(rows: list[np.ndarray]) -> list[np.ndarray]:
+    for row in rows:
+        row[:, 3] = rows[0][:, 3]
+    return rows
+
+
+def turning_only(rows: list[np.ndarray]) -> list[np.ndarray]:
+    for i, row in enumerate(rows):
+        row[:, :3] = cv2.Rodrigues(np.array([0.0, 0.05 * i, 0.0]))[0]
+        row[:, 3] = 0.001 * i
+    return rows
+
+
+def other_poses(rows: list[np.ndarray]) -> list[np.ndarray]:
+    """Poses of a drive to the side."""
+    for row in rows:
+        row[:, 3] = [row[2, 3], 0.0, 0.0]
+    return rows
+
+
+def cut_off(folder: Path) -> None:
+    path = folder / "image_r/000010.png"
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def cut_off_jpeg(folder: Path) -> None:
+    for path in sorted((folder / "image_r").iterdir()):
+        data = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
+        path.with_suffix(".jpg").write_bytes(data[: len(data) // 2] if path.stem == "000003" else data)
+        path.unlink()
+
+
+def another_size(folder: Path) -> None:
+    path = folder / "image_l/000004.png"
+    cv2.imwrite(str(path), cv2.imread(str(path))[:-8])
+
+
+def printed_colours(folder: Path) -> None:
+    for path in sorted((folder / "image_l").iterdir()):
+        path.with_suffix(".jpg").write_bytes(cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes())
+        path.unlink()
+    path = folder / "image_l/000006.jpg"
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\xff\xc0")
+    data[at + 9] = 4
+    path.write_bytes(bytes(data))
+
+
+def hundred_megapixels(folder: Path) -> None:
+    path = folder / "image_l/000000.png"
+    data = bytearray(path.read_bytes())
+    data[16:24] = struct.pack(">II", 10_000, 10_000)
+    path.write_bytes(bytes(data))
+
+
+def many_pictures_without_poses(folder: Path) -> None:
+    path = folder / "poses.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:12]))
+
+
+@pytest.mark.parametrize(
+    ("change", "found", "do"),
+    [
+        (poses(not_a_number), "not finite", "finite"),
+        (poses(left_handed), "left-handed", "mirror"),
+        (poses(sheared), "no rotation", "rigid"),
+        (poses(centimetres_from_the_twelfth_on), "metres and centimetres mixed", "metres"),
+        (poses(standing), "stands, or only turns", "moves"),
+        (poses(turning_only), "stands, or only turns", "moves"),
+        (poses(other_poses), "place alike", "their own poses"),
+        (many_pictures_without_poses, "24 photographs and 12 poses", "these very photographs"),
+        (cut_off, "cut off", "whole"),
+        (cut_off_jpeg, "cut off", "whole"),
+        (another_size, f"{WIDTH}x{HEIGHT - 8}", "as they were"),
+        (printed_colours, "CMYK", "grey or RGB"),
+        (hundred_megapixels, "100,000,000", "correct"),
+        (lambda folder: (folder / "poses.txt").unlink(), "no poses.txt", "beside the pictures"),
+        (lambda folder: (folder / "calib.txt").write_text("1 2 3"), "3 numbers", "12 numbers"),
+    ],
+)
+def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
+    tmp_path: Path, change: Change, found: str, do: str, quick_fit: None
+) -> None:
+    folder = write_kitti(tmp_path / "street")
+    change(folder)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(InputError) as caught:
+        import_drive(folder, tmp_path / "out")
+    assert found in caught.value.found
+    assert do in caught.value.do_this
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_axes_that_both_fit_are_asked_for(tmp_path: Path, quick_fit: None) -> None:
+    folder = write_transforms(tmp_path / "walk", say_axes=False)
+    blank = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    for path in (folder / "images").iterdir():
+        cv2.imwrite(str(path), blank)
+    with pytest.raises(InputError, match="'axes'") as caught:
+        import_drive(folder, tmp_path / "out")
+    assert '"axes": "opengl"' in caught.value.do_this
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_colmap_model_that_is_cut_off_is_named(tmp_path: Path, name: str) -> None:
+    folder = write_colmap(tmp_path / "a", True)
+    path = folder / f"sparse/0/{name}.bin"
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(InputError, match="COLMAP"):
+        import_drive(folder, tmp_path / "out")
+
+
+def test_nothing_known_names_the_forms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "odd").mkdir()
+    (tmp_path / "odd/notes.txt").write_text("none")
+    assert run_command(["import", "drive", str(tmp_path / "odd"), "--out", str(tmp_path / "out"), "--json"]) == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert "notes.txt" in error["found"]
+    assert "KITTI" in error["do"]
+
+
+def test_photographs_without_poses_name_the_extra_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    (tmp_path / "photos").mkdir()
+    for i in range(10):
+        cv2.imwrite(str(tmp_path / f"photos/{i}.png"), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    with pytest.raises(InputError, match="pycolmap is not installed") as caught:
+        import_drive(tmp_path / "photos", tmp_path / "out")
+    assert "[sfm]" in caught.value.do_this
+    assert not (tmp_path / ".out.poses").exists()

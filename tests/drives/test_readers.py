@@ -1,0 +1,127 @@
+"""Every form of a recorded drive gives the same street: its way, its road and its scale."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.drives.build import _points
+from alpasim_plugin.drives.opening import read_source
+from alpasim_plugin.drives.placing import PlacedDrive, place
+from alpasim_plugin.drives.source import SourceDrive, checked
+from tests.drives.street import COUNT, STEP_M, write_colmap, write_kitti, write_transforms
+
+WAY_M = (COUNT - 1) * STEP_M
+
+
+def told(*given: Any) -> None:
+    """Take reports of progress."""
+
+
+def opened(folder: Path) -> tuple[SourceDrive, PlacedDrive]:
+    drive = checked(read_source(folder, folder / "work", told), folder)
+    return drive, place(drive, _points(drive, folder, told), camera_height_m=1.5)
+
+
+def assert_is_the_street(placed: PlacedDrive, rel: float = 0.03) -> None:
+    ego = placed.ego.xyz
+    assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx(WAY_M, rel=rel)
+    assert placed.strip is not None
+    assert np.abs(placed.strip.section_errors).max() < 0.05
+    mount = placed.mounts[next(iter(placed.mounts))]
+    assert mount[2, 3] == pytest.approx(1.5, abs=0.08)
+    assert mount[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=0.05)  # it looks ahead
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl"])
+def test_transforms_of_both_conventions(tmp_path: Path, axes: str) -> None:
+    drive, placed = opened(write_transforms(tmp_path / "a", axes=axes))
+    assert drive.metric is None
+    assert_is_the_street(placed)
+
+
+def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path: Path) -> None:
+    for axes in ("opencv", "opengl"):
+        drive, _ = opened(write_transforms(tmp_path / axes, axes=axes, say_axes=False))
+        assert any(f"axes recognised as {axes}" in note for note in drive.notes)
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_a_colmap_model(tmp_path: Path, binary: bool) -> None:
+    drive, placed = opened(write_colmap(tmp_path / "a", binary))
+    assert (drive.kind, len(drive.pictures)) == ("colmap", COUNT)
+    assert_is_the_street(placed)
+
+
+@pytest.mark.parametrize(
+    ("model", "bend"),
+    [("SIMPLE_RADIAL", (-0.05,)), ("OPENCV", (-0.08, 0.01, 0.001, -0.001)), ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0))],
+)
+def test_photographs_are_freed_of_every_lens(tmp_path: Path, model: str, bend: tuple[float, ...]) -> None:
+    drive = read_source(write_colmap(tmp_path / "a", True, model, bend), tmp_path, told)
+    plain = read_source(write_colmap(tmp_path / "b", True), tmp_path, told)
+    bent, straight = drive.pictures[5], plain.pictures[5]
+    K = bent.lens.straight_K()
+    H = straight.lens.K @ np.linalg.inv(K)
+    back = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    warped = cv2.warpPerspective(straight.rgb(), np.linalg.inv(back) @ H @ back, (320, 128), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    inner = (slice(20, -20), slice(30, -30))
+    off = np.abs(cv2.GaussianBlur(warped, (0, 0), 1.5)[inner].astype(float) - cv2.GaussianBlur(bent.rgb(), (0, 0), 1.5)[inner]).mean()
+    assert off < 6.0
+    assert np.abs(straight.rgb()[inner].astype(float) - bent.rgb()[inner]).mean() > 2 * off
+
+
+def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path / "sequences/07")
+    for old, new in (("image_l", "image_2"), ("image_r", "image_3")):
+        (folder / old).rename(folder / new)
+    rows = (folder / "calib.txt").read_text().splitlines()
+    (folder / "calib.txt").write_text("\n".join(f"P{i}: {rows[i % 2]}" for i in range(4)) + "\nTr: " + rows[0])
+    (tmp_path / "poses").mkdir()
+    (folder / "poses.txt").rename(tmp_path / "poses/07.txt")
+    (folder / "times.txt").write_text("\n".join(f"{0.12 * i:.4e}" for i in range(COUNT)))
+    drive, placed = opened(folder)
+    assert drive.never_fitted == ("right",)
+    assert [one.t_us for one in drive.of("left")[:3]] == [0, 120_000, 240_000]
+    assert_is_the_street(placed)
+    assert np.linalg.norm(placed.mounts["right"][:3, 3] - placed.mounts["left"][:3, 3]) == pytest.approx(0.54, abs=0.01)
+
+
+def test_the_facts_of_a_real_street(shared_data: Path) -> None:
+    folder = shared_data / "kitti-street"
+    if not folder.is_dir():
+        pytest.skip("the street is not here")
+    drive = checked(read_source(folder, folder / "nowhere", told), folder)
+    assert (len(drive.of("left")), len(drive.of("right"))) == (51, 51)
+    across = np.linalg.inv(drive.of("left")[9].T_world_camera) @ drive.of("right")[9].T_world_camera
+    assert across[:3, 3] == pytest.approx([0.5372, 0.0, 0.0], abs=1e-4)
+
+
+def test_the_facts_of_a_real_rig(shared_data: Path) -> None:
+    folder = shared_data / "dgp"
+    if not folder.is_dir():
+        pytest.skip("the rig is not here")
+    drive = checked(read_source(folder, folder / "nowhere", told), folder)
+    assert (drive.front, len(drive.cameras), len(drive.pictures), len(drive.tracks)) == ("CAMERA_01", 6, 18, 9)
+    assert drive.points is not None
+    placed = place(drive, drive.points)
+    assert placed.strip is not None
+    assert np.abs(placed.strip.section_errors).max() < 0.05
+    assert placed.ego.xyz[:, 2] == pytest.approx(0.0, abs=0.05)
+
+
+def test_times_put_photographs_in_order(tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path / "a", unit="m")
+    document = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(document["frames"]):
+        frame["t_us"] = 50_000 * i
+    document["frames"].reverse()
+    (folder / "transforms.json").write_text(json.dumps(document))
+    drive = read_source(folder, folder / "work", told)
+    assert [one.t_us for one in drive.pictures] == [50_000 * i for i in range(COUNT)]
+    assert drive.metric == "the file's word that its unit is the metre"

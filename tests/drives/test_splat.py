@@ -1,0 +1,113 @@
+"""A trained model of the user's own drives: in a unit of its own, without harmonics, with broken Gaussians; and not in another frame."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.drives.splat import import_splat
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.packed import write_splat
+from alpasim_plugin.gaussians.files.ply import write_ply
+from alpasim_plugin.world.ground import height_at
+from scenarios.load import load_scenario
+from tests.drives.street import COUNT, STEP_M, Street, write_colmap, write_transforms
+
+UNIT = 0.2  # of the model, metres
+
+
+def street_cloud(scale: float = UNIT, turn: np.ndarray | None = None) -> GaussianCloud:
+    """Return the street's road and walls as Gaussians, in a unit and a frame of their own."""
+    rng = stream("splat", 0, "street")
+    road = rng.uniform([-2.0, -4.0, 0.0], [40.0, 4.0, 0.0], (12_000, 3))
+    wall = rng.uniform([-2.0, -5.0, 0.0], [40.0, 5.0, 4.0], (6_000, 3))
+    wall[:, 1] = np.where(wall[:, 1] > 0, 5.0, -5.0)
+    points = np.concatenate([road, wall])
+    points[:, 2] += Street().ground(points[:, 0])
+    points = scale * (points if turn is None else points @ turn.T)
+    n = len(points)
+    return GaussianCloud(points, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), 0.08 * scale), np.full(n, 0.9), np.zeros((n, 1, 3)))
+
+
+def poses_of(folder: Path, scale: float = UNIT, turn: np.ndarray | None = None, photographs: bool = False) -> Path:
+    """Write the poses of the drive in the model's frame."""
+    path = write_transforms(folder) / "transforms.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        T = np.array(frame["transform_matrix"])
+        if turn is not None:
+            T[:3] = turn @ T[:3]
+        T[:3, 3] *= scale
+        frame["transform_matrix"] = T.tolist()
+    path.write_text(json.dumps(document))
+    if not photographs:
+        for picture in (folder / "images").iterdir():
+            picture.unlink()
+    return path
+
+
+def assert_drives(out: Path) -> None:
+    scenario = load_scenario(out / "scenario.yaml")
+    ego = scenario.ego_log.xyz
+    assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.05)
+    assert np.abs(ego[:, 2] - height_at(scenario.ground, ego)).max() < 0.08
+    assert scenario.model
+
+
+def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path: Path) -> None:
+    turn = np.diag([1.0, -1.0, -1.0])
+    write_ply(tmp_path / "street.ply", street_cloud(turn=turn))
+    quality = import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses", turn=turn), tmp_path / "out")
+    assert_drives(tmp_path / "out")
+    assert any("no photographs" in note for note in quality["notes"])
+    assert quality["photographs"] == {}
+    assert load_scenario(tmp_path / "out/scenario.yaml").recording == ()
+    assert quality["coverage"][0]["share"] > 0.5
+
+
+def test_a_splat_without_harmonics_with_photographs_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_splat(tmp_path / "street.splat", street_cloud())
+    poses = poses_of(tmp_path / "poses", photographs=True)
+    command = ["import", "splat", str(tmp_path / "street.splat"), "--poses", str(poses), "--out", str(tmp_path / "out"), "--json"]
+    assert run_command(command) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "held-out" in told
+    assert_drives(tmp_path / "out")
+
+
+def test_broken_gaussians_are_left_out_and_said(tmp_path: Path) -> None:
+    cloud = street_cloud(0.5)
+    means = np.array(cloud.means)
+    broken = GaussianCloud(means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    write_ply(tmp_path / "street.ply", broken)
+    data = bytearray((tmp_path / "street.ply").read_bytes())
+    body = data.index(b"end_header\n") + len(b"end_header\n")
+    data[body : body + 4] = np.float32(np.nan).tobytes()
+    (tmp_path / "street.ply").write_bytes(bytes(data))
+    quality = import_splat(tmp_path / "street.ply", write_colmap(tmp_path / "poses", True), tmp_path / "out")
+    assert any("1 " in note and "17999" in note.replace(",", "") for note in quality["notes"])
+    assert_drives(tmp_path / "out")
+
+
+def test_poses_of_another_frame_are_refused_and_nothing_is_left(tmp_path: Path) -> None:
+    write_ply(tmp_path / "street.ply", street_cloud())
+    poses = poses_of(tmp_path / "poses", scale=30.0)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(InputError, match="frame") as caught:
+        import_splat(tmp_path / "street.ply", poses, tmp_path / "out")
+    assert "the way of the poses" in caught.value.found
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_thirty_million_gaussians_are_refused_by_their_header(tmp_path: Path) -> None:
+    write_ply(tmp_path / "street.ply", street_cloud())
+    data = (tmp_path / "street.ply").read_bytes().replace(b"element vertex 18000", b"element vertex 30000000", 1)
+    (tmp_path / "street.ply").write_bytes(data)
+    with pytest.raises(InputError, match="30,000,000"):
+        import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses"), tmp_path / "out")
