@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from alpasim_plugin.fixers.settings import (
     BundleKind,
+    FixerSettings,
     Part,
     Positive,
     Unit,
@@ -17,9 +18,6 @@ from alpasim_plugin.fixers.settings import (
     check_steps,
     counted_steps,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 class PixelSizesSettings(Part):
@@ -38,7 +36,21 @@ class PixelSizesSettings(Part):
 PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map", "references", "recording"))
 
 
-class PixelFixerSettings(WeightedSettings):
+class FrameByFrameSettings(FixerSettings):
+    """Of a fixer that works on single frames."""
+
+    @property
+    def loop_mode(self) -> str:
+        """How the closed loop runs the fixer, in one word."""
+        return "frame by frame"
+
+    @model_validator(mode="after")
+    def _no_blocks(self) -> Self:
+        check_no_blocks(self)
+        return self
+
+
+class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
     """A causal generator in pixels, one frame at a time."""
 
     bundle_kind: ClassVar[BundleKind] = PER_FRAME
@@ -61,11 +73,6 @@ class PixelFixerSettings(WeightedSettings):
     )
 
     @property
-    def loop_mode(self) -> str:
-        """How the closed loop runs the fixer, in one word."""
-        return "frame by frame"
-
-    @property
     def unit(self) -> Unit:
         """What a frame costs."""
         return Unit(1, len(self.steps), 0, 0)
@@ -78,7 +85,6 @@ class PixelFixerSettings(WeightedSettings):
     @model_validator(mode="after")
     def _consistent(self) -> PixelFixerSettings:
         check_steps(self.steps)
-        check_no_blocks(self)
         parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self.weights, key) is not None]
         if parts:
             raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")

@@ -129,6 +129,12 @@ def photograph_camera(one: Photograph, width: int) -> PinholeCamera:
     return PinholeCamera.from_pose(w, h, np.diag([w / one.width, h / one.height, 1.0]) @ one.K, one.T_world_camera)
 
 
+def posed_photograph(one: Photograph, width: int) -> tuple[PinholeCamera, U8]:
+    """Read a photograph at a width in pixels, never larger than it is, and return its camera and picture ``(H, W, 3)``."""
+    camera = photograph_camera(one, width)
+    return camera, photograph_picture(one, camera)
+
+
 def photograph_picture(one: Photograph, camera: PinholeCamera) -> U8:
     """Read a photograph at the size of its camera ``(H, W, 3)``.
 

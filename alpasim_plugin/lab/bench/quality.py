@@ -14,7 +14,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.warp import HELD
 from alpasim_plugin.lab.bench.map_error import MapShift
 from alpasim_plugin.lab.training.reference_store import SequenceReferences
 from alpasim_plugin.lab.video_metrics import clip_quality
@@ -24,7 +23,6 @@ from alpasim_plugin.plugins.interfaces import Fixer
 from alpasim_plugin.plugins.parts import PartSpec
 
 RAW = "3dgs"  # the variant of the unfixed render
-NEAREST = "nearest"  # the nearest recorded frame, warped without a network, and the render where that does not hold
 VERSION = 2  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
@@ -64,8 +62,8 @@ class Variant:
     map_shift: MapShift | None = None  # None: the map as it is
 
     def __post_init__(self) -> None:
-        if self.spec is None and self.label not in (RAW, NEAREST, TRUTH):
-            do = f"name a fixer, or {RAW}, {NEAREST}, {TRUTH}"
+        if self.spec is None and self.label not in (RAW, TRUTH):
+            do = f"name a fixer, or one of {RAW}, {TRUTH}"
             raise InputError("choosing what to measure", f"variant {self.label!r}", "no fixer", do)
 
     def content(self) -> dict[str, Any]:
@@ -122,8 +120,7 @@ def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> Var
             "give a session exactly for a fixer's variant",
         )
     if fixer is None or variant.spec is None or not isinstance(variant.spec.settings, FixerSettings):
-        shown = {RAW: clip.render, TRUTH: clip.truth}.get(variant.label)
-        return VariantResult(_nearest(clip) if shown is None else np.array(shown), (), {})
+        return VariantResult(np.array(clip.truth if variant.label == TRUTH else clip.render), (), {})
     tally, frames = StreamStats(), []
     for block in refine_frames(_frames(clip, variant.spec.settings), fixer):
         tally.add(block)
@@ -147,15 +144,6 @@ def measure(clip: QualityClip, variant: Variant, result: VariantResult, seed: in
         "ms_per_frame": [round(ms, 4) for ms in result.ms_per_frame[1:] or result.ms_per_frame],
         "series": {name: [float(f"{v:.{DIGITS}g}") for v in values] for name, values in found.series.items()},
     }
-
-
-def _nearest(clip: QualityClip) -> U8:
-    out = np.array(clip.render)
-    for frame, references in zip(out, clip.references(1), strict=True):
-        for image in references:
-            held = image[..., 3] == HELD
-            frame[held] = image[held, :3]
-    return out
 
 
 def _frames(clip: QualityClip, settings: FixerSettings) -> Iterator[tuple[Frame, U8 | None]]:

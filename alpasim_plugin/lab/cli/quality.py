@@ -14,7 +14,7 @@ from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.lab.bench.judged import Judging
-from alpasim_plugin.lab.bench.quality import NEAREST, RAW, Variant
+from alpasim_plugin.lab.bench.quality import RAW, Variant
 from alpasim_plugin.lab.bench.quality_run import DOING, Given, QualityRun, Work, evenly, write_results
 from alpasim_plugin.lab.cli.training_options import whole_numbers
 from alpasim_plugin.lab.learned_metrics.table import judged_markdown
@@ -121,7 +121,7 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         if label in variants or label == TRUTH or "/" in label:
             found = f"label {label!r} is taken, or no name of a folder"
             raise InputError(DOING, f"--fixer {text}", found, "write LABEL=NAME with labels of your own")
-        if fixer in (RAW, NEAREST):
+        if fixer == RAW:
             variants[label] = Variant(label)
             continue
         fixer, given = split_settings(fixer)

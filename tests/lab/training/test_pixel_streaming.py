@@ -33,10 +33,9 @@ def test_streaming_equals_the_rollout_of_the_training(tmp_path: Path, holes: str
         render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, (), (0, 0), torch.ones(1, 1)
     )
     net = generator().requires_grad_(False)
+    objectives = PixelObjectives(0, 0, 0, horizon=99, source="mixed" if holes == "noise" else "noise")
     with torch.no_grad():
-        whole = pixel_losses(
-            net, sample, net.start(render[:, 0]), PixelObjectives(0, 0, 0, horizon=99, source="mixed" if holes == "noise" else "noise"), None
-        ).predictions[0]
+        whole = pixel_losses(net, sample, net.start(render[:, 0]), objectives, None).predictions[0]
     expected = whole.clamp(-1, 1).add(1).mul(127.5).round().to(torch.uint8).numpy()
     assert load_generator(at(bundle)).step.recorded  # the last frames went through a recording
     assert np.abs(streamed.astype(int) - pixels(FRAMES)).mean() > 2  # these weights do something

@@ -1,0 +1,50 @@
+"""The control without a network: the nearest recorded frame, warped into the view, and the render where that does not hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from pydantic import Field
+
+from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.fixers.pixel_settings import FrameByFrameSettings
+from alpasim_plugin.fixers.warp import HELD
+from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
+
+
+class NearestSettings(FrameByFrameSettings):
+    """Which recorded frames are looked at."""
+
+    references: int = Field(default=1, ge=1, le=8, description="Recorded frames; a nearer one is shown before a farther one.")
+
+
+class NearestFixer(Fixer):
+    """Show what references show, and what a fixer that learned must be better than.
+
+    Args:
+        settings: How many references.
+        scene_id, seed, device, threads: As every fixer takes them; without effect here.
+    """
+
+    settings_model = NearestSettings
+    note = "no network"
+    blocks = BlockRule(1, 1)
+
+    def __init__(self, settings: NearestSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+        self.settings, self.label = settings, f"{settings.name}, no network"
+
+    def reset(self, seed: int) -> None:
+        """Start a new rollout; there is no history."""
+
+    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        """Return the frames with their references laid over them, the nearest on top."""
+        return tuple(self.advance(frame, None, None)[0] for frame in block)
+
+    def advance(self, frame: Frame, sdmap: U8 | None, past: None) -> tuple[Frame, None]:
+        """Fix one frame; there is no past."""
+        rgb = frame.rgb.copy()
+        for image in reversed(frame.references):
+            held = image[..., 3] == HELD
+            rgb[held] = image[held, :3]
+        return replace(frame, rgb=rgb, references=()), None
