@@ -31,7 +31,9 @@ class NearestFixer(Fixer):
     note = "no network"
     blocks = BlockRule(1, 1)
 
-    def __init__(self, settings: NearestSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(
+        self, settings: NearestSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None
+    ) -> None:
         self.settings, self.label = settings, f"{settings.name}, no network"
 
     def reset(self, seed: int) -> None:
