@@ -200,3 +200,61 @@ def test_a_change_with_support_stays() -> None:
     assert not share(invented(), sdmap=0.5).any()  # the map shows something there
     assert not share(invented(), before=invented().roll(8, 2)).any()  # it was there before, nearby
     assert not share(invented(level=0.1)).any()  # it is a repair, not an invention
+
+
+@pytest.fixture(scope="module")
+def reading(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write weights that read references and give them most of the picture."""
+    torch.manual_seed(5)
+    net = PixelGenerator(replace(SIZES, blend=8))
+    assert net.blend is not None
+    assert net.blend.write.bias is not None
+    with torch.no_grad():
+        net.blend.write.bias[:4] = 4.0
+    path = tmp_path_factory.mktemp("reading") / "small.safetensors"
+    settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=render", "generator.blend=8", "references=2"])
+    assert isinstance(settings, PixelFixerSettings)
+    save_bundle(path, {"generator": net.state_dict()}, settings, trained=True)
+    return path
+
+
+def with_reference(frame: Frame, grey: int, holds: int = 255) -> Frame:
+    image = np.full((*SIZE, 4), grey, np.uint8)
+    image[..., 3] = holds
+    return replace(frame, references=(image,))
+
+
+def test_a_reference_becomes_the_picture_and_the_facts_say_so(reading: Path) -> None:
+    fixer = session(reading, "holes=render", "keep_render=false")
+    (out,) = fixer.step([with_reference(FRAMES[0], 200)], MAPS[:1])
+    assert np.abs(out.rgb.astype(int) - 200).mean() < 12
+    assert out.references == ()
+    assert out.facts["recorded_share"] > 0.9
+    (none,) = session(reading, "holes=render").step([with_reference(FRAMES[0], 200, 0)], MAPS[:1])
+    assert none.facts["recorded_share"] < 1e-3
+    assert 0 <= none.facts["guessed_share"] <= 1
+
+
+def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading: Path) -> None:
+    front, side = with_reference(FRAMES[0], 90), replace(FRAMES[1], camera="side", t_us=FRAMES[0].t_us)
+    both = session(reading, "holes=render").step([front, side], MAPS[:2])
+    for i, frame in enumerate((front, side)):
+        (alone,) = session(reading, "holes=render").step([frame], MAPS[i : i + 1])
+        assert np.abs(both[i].rgb.astype(int) - alone.rgb).max() <= 1
+
+
+def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading: Path) -> None:
+    grey = replace(FRAMES[0], rgb=np.full((*SIZE, 3), 20, np.uint8), alpha=np.ones(SIZE, np.float32))
+    (out,) = session(reading, "holes=render").step([with_reference(grey, 240)], [])
+    assert out.rgb.mean() > 200
+
+
+def test_a_reference_of_another_size_is_refused(reading: Path) -> None:
+    wrong = replace(FRAMES[0], references=(np.zeros((4, 4, 4), np.uint8),))
+    with pytest.raises(InputError, match="a reference of uint8"):
+        session(reading).step([wrong], MAPS[:1])
+
+
+def test_weights_that_read_no_references_leave_them_alone(bundle: Path) -> None:
+    plain, given = (session(bundle).step([frame], MAPS[:1])[0] for frame in (FRAMES[0], with_reference(FRAMES[0], 200)))
+    assert np.array_equal(plain.rgb, given.rgb)
