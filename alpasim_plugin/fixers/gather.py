@@ -1,4 +1,7 @@
-"""`gather_cells` for processors: one pass over the images instead of a copy per image and another to join them."""
+"""What a generator in pixels reads and writes, for processors: one pass over the images instead of one for each operation.
+
+`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `mix_cpu` is `nets.reference_blend.mix`.
+"""
 
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -11,6 +14,10 @@ from numba import njit
 from torch import Tensor
 
 from alpasim_plugin.nets.pixel_generator import CELL, DETAIL, DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
+from alpasim_plugin.nets.reference_blend import NOWHERE, BlendHeads
+
+
+LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 
 
 def gather_cells_cpu(render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor) -> GatheredCells:
@@ -68,6 +75,63 @@ def _gather_fine(render, opacity, output, fine):
                         for c in range(3):
                             cell[run * r + 3 * k + c] = render[b, y, x, c]
                             cell[three + one + run * r + 3 * k + c] = output[b, y, x, c]
+
+
+def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
+    """Return the same as `nets.reference_blend.mix`, of float32 tensors on the CPU, to rounding."""
+    out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
+    images = (np.ascontiguousarray(x.numpy()) for x in (repaired, references, *heads))
+    _mix(*images, np.float32(NOWHERE), out.numpy(), recorded.numpy())
+    return out, recorded
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _mix(repaired, references, weight, offset_px, correction, nowhere, out, recorded):
+    batch, count, height, width, _ = references.shape
+    side, half = DETAIL, np.float32(0.5)
+    cell_rows, cell_columns = height // side, width // side
+    for b in range(batch):
+        for y in range(height):
+            # Offsets are interpolated between the middles of cells.
+            v = min(max((y + half) / side - half, np.float32(0.0)), np.float32(cell_rows - 1))
+            v0 = int(v)
+            v1, fv = min(v0 + 1, cell_rows - 1), np.float32(v - v0)
+            for x in range(width):
+                u = min(max((x + half) / side - half, np.float32(0.0)), np.float32(cell_columns - 1))
+                u0 = int(u)
+                u1, fu = min(u0 + 1, cell_columns - 1), np.float32(u - u0)
+                i, j = y // side, x // side
+                inside = (y % side) * side + x % side
+                total = np.float32(1.0)
+                r, g, blue = repaired[b, y, x, 0], repaired[b, y, x, 1], repaired[b, y, x, 2]
+                for k in range(count):
+                    field = offset_px[b, k]
+                    w00, w01, w10, w11 = (1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu
+                    dx = w00 * field[v0, u0, 0] + w01 * field[v0, u1, 0] + w10 * field[v1, u0, 0] + w11 * field[v1, u1, 0]
+                    dy = w00 * field[v0, u0, 1] + w01 * field[v0, u1, 1] + w10 * field[v1, u0, 1] + w11 * field[v1, u1, 1]
+                    px = min(max(x + dx, np.float32(0.0)), np.float32(width - 1))
+                    py = min(max(y + dy, np.float32(0.0)), np.float32(height - 1))
+                    x0, y0 = int(px), int(py)
+                    x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+                    fx, fy = np.float32(px - x0), np.float32(py - y0)
+                    a00, a01, a10, a11 = (1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx
+                    image = references[b, k]
+                    holds = a00 * image[y0, x0, 3] + a01 * image[y0, x1, 3] + a10 * image[y1, x0, 3] + a11 * image[y1, x1, 3]
+                    share = np.exp(min(weight[b, k, i, j, inside], LARGEST)) * min(max(holds, nowhere), np.float32(1.0))
+                    total += share
+                    extra = correction[b, k, i, j]
+                    at = 3 * inside
+                    r += share * (
+                        a00 * image[y0, x0, 0] + a01 * image[y0, x1, 0] + a10 * image[y1, x0, 0] + a11 * image[y1, x1, 0] + extra[at]
+                    )
+                    g += share * (
+                        a00 * image[y0, x0, 1] + a01 * image[y0, x1, 1] + a10 * image[y1, x0, 1] + a11 * image[y1, x1, 1] + extra[at + 1]
+                    )
+                    blue += share * (
+                        a00 * image[y0, x0, 2] + a01 * image[y0, x1, 2] + a10 * image[y1, x0, 2] + a11 * image[y1, x1, 2] + extra[at + 2]
+                    )
+                out[b, y, x, 0], out[b, y, x, 1], out[b, y, x, 2] = r / total, g / total, blue / total
+                recorded[b, y, x, 0] = 1 - 1 / total
 
 
 def draw_and_gather() -> None:

@@ -19,10 +19,11 @@ from torch import Tensor, nn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
-from alpasim_plugin.fixers.gather import gather_cells_cpu
+from alpasim_plugin.fixers.gather import gather_cells_cpu, mix_cpu
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
 from alpasim_plugin.nets.pixel_generator import GatheredCells, PixelGenerator, PixelSizes, PixelState
+from alpasim_plugin.nets.reference_blend import BlendHeads
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -108,8 +109,11 @@ class RecordedStep:
         self._calls[shape] += 1
         if self._after is not None and shape not in self.recorded and self._calls[shape] > self._after:
             self.recorded[shape] = _record(self._step, tensors)
-        out, *after = self.recorded.get(shape, self._step)(*tensors)
-        return out, PixelState(*after)
+        out, hidden, kept, frames, *heads = self.recorded.get(shape, self._step)(*tensors)
+        recorded = torch.zeros_like(render[..., :1])
+        if heads:
+            out, recorded = mix_cpu(out, read[0], BlendHeads(*heads))
+        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames, recorded)
 
 
 class _Step(nn.Module):
@@ -122,8 +126,8 @@ class _Step(nn.Module):
     def forward(self, coarse: Tensor, fine: Tensor, render: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
         kept = len(PixelState._fields)
         references = others[kept] if len(others) > kept else None
-        out, after = self.net.from_cells(GatheredCells(coarse, fine), render, PixelState(*others[:kept]), None, references)
-        return (out, *after)
+        made = self.net.before_blend(GatheredCells(coarse, fine), render, PixelState(*others[:kept]), None, references)
+        return (*made[:-1], *(made.heads or ()))
 
 
 def _record(step: _Step, tensors: tuple[Tensor, ...]) -> Any:

@@ -35,7 +35,7 @@ from alpasim_plugin.nets.pixel_layers import (
     repeat_per_pixel,
     small,
 )
-from alpasim_plugin.nets.reference_blend import CELL, DETAIL, ReferenceBlend, beside_render
+from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BlendHeads, ReferenceBlend, beside_render, mix
 
 GRID_PX = 16  # sides are multiples of it
 IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
@@ -82,6 +82,16 @@ class PixelState(NamedTuple):
         """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
         at = fresh[:, None, None, None]
         return PixelState(*(torch.where(at, new, old) for new, old in zip(start, self, strict=True)))
+
+
+class BeforeBlend(NamedTuple):
+    """What the network made of a frame, before references are blended in."""
+
+    repaired: Tensor  # (B, H, W, 3) render plus change
+    hidden: Tensor  # as in `PixelState`, as are the next two
+    kept: Tensor
+    frames: Tensor
+    heads: BlendHeads | None  # None without references
 
 
 class GatheredCells(NamedTuple):
@@ -197,6 +207,16 @@ class PixelGenerator(nn.Module):
         self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, references: Tensor | None = None
     ) -> tuple[Tensor, PixelState]:
         """Predict the clean frame from what `gather_cells` gathered; see `forward`."""
+        made = self.before_blend(gathered, render, state, t, references)
+        out, recorded = made.repaired, torch.zeros_like(render[..., :1])
+        if made.heads is not None and references is not None:
+            out, recorded = mix(made.repaired, references, made.heads)
+        return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
+
+    def before_blend(
+        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, references: Tensor | None = None
+    ) -> BeforeBlend:
+        """Run the network up to the blend of its picture with the references; see `forward`."""
         dtype = self.stem.weight.dtype
         stem, read = self.stem(gathered.coarse.to(dtype)), self.read(gathered.fine.to(dtype))
         beside = None
@@ -218,10 +238,8 @@ class PixelGenerator(nn.Module):
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
         fine = activation(read.add_(self.up2(y)), inplace=True)
         fine = activation(self.refine(fine), inplace=True)
-        out, recorded = pixels(self.write(fine), DETAIL).float() + render, torch.zeros_like(render[..., :1])
-        if self.blend is not None and references is not None and beside is not None:
-            out, recorded = self.blend(y, fine, out, references, beside)
-        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames, recorded)
+        heads = self.blend(y, fine, beside) if self.blend is not None and beside is not None else None
+        return BeforeBlend(pixels(self.write(fine), DETAIL).float() + render, hidden, kept, frames, heads)
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:

@@ -14,6 +14,8 @@ references. A warp that is wrong costs nothing where the network gives it no wei
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -27,8 +29,16 @@ NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarit
 DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
 
 
+class BlendHeads(NamedTuple):
+    """How references enter the picture, at half its resolution; float32."""
+
+    weight: Tensor  # (B, K, H / 2, W / 2, 4) logarithm of each pixel's weight over that of the repaired render, `cells` of one channel
+    offset_px: Tensor  # (B, K, H / 2, W / 2, 2) x and y of where it is looked up
+    correction: Tensor  # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
+
+
 class ReferenceBlend(nn.Module):
-    """Read references and blend them with the generator's own picture.
+    """Read references; `mix` then blends them with the generator's own picture.
 
     Args:
         coarse: Channels of the generator at 1/4.
@@ -67,35 +77,47 @@ class ReferenceBlend(nn.Module):
         mean = beside.mean(dim=1).to(self.stem.weight.dtype)
         return self.stem(cells(mean, CELL)), self.read(cells(mean, DETAIL))
 
-    def forward(self, y: Tensor, fine: Tensor, repaired: Tensor, references: Tensor, beside: Tensor) -> tuple[Tensor, Tensor]:
-        """Blend.
+    def forward(self, y: Tensor, fine: Tensor, beside: Tensor) -> BlendHeads:
+        """Say how every reference enters the picture.
 
         Args:
             y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
-            repaired: ``(B, H, W, 3)`` render plus residual.
-            references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
             beside: ``(B, K, H, W, 4)`` from `beside_render`.
-
-        Returns:
-            ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
         """
-        b, k, h, w, _ = references.shape
+        b, k = beside.shape[:2]
         each = beside.flatten(0, 1).to(fine.dtype)
         at4 = activation(_repeated(y, k) + self.coarse(cells(each, CELL)), inplace=True)
         for conv in self.align:
             at4 = activation(conv(at4), inplace=True)
         joined = _repeated(fine, k) + self.own(cells(each, DETAIL)) + self.up(at4)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
-        weight, offset, correction = said.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
+        weight, offset, correction = said.unflatten(0, (b, k)).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
         seen_at4 = F.interpolate(self.shift(at4).float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
-        moved = _sampled(references.flatten(0, 1), torch.tanh(offset + seen_at4.permute(0, 2, 3, 1)) * OFFSET_PX)
-        colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
-        holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
-        logits = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
-        shares = torch.cat([torch.zeros_like(logits[:, :1]), logits], dim=1).softmax(dim=1)
-        out = shares[:, 0] * repaired + (shares[:, 1:] * colour).sum(dim=1)
-        return out, 1 - shares[:, 0]
+        offset_px = torch.tanh(offset + seen_at4.permute(0, 2, 3, 1).unflatten(0, (b, k))) * OFFSET_PX
+        return BlendHeads(weight, offset_px, correction)
+
+
+def mix(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
+    """Blend the picture with its references.
+
+    Args:
+        repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
+        references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
+        heads: Of the same.
+
+    Returns:
+        ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
+    """
+    b, k, h, w, _ = references.shape
+    weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
+    moved = _sampled(references.flatten(0, 1), offset_px)
+    colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
+    holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
+    logits = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
+    shares = torch.cat([torch.zeros_like(logits[:, :1]), logits], dim=1).softmax(dim=1)
+    out = shares[:, 0] * repaired + (shares[:, 1:] * colour).sum(dim=1)
+    return out, 1 - shares[:, 0]
 
 
 def beside_render(references: Tensor, render: Tensor) -> Tensor:

@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.gather import gather_cells_cpu
+from alpasim_plugin.fixers.gather import gather_cells_cpu, mix_cpu
 from alpasim_plugin.nets.pixel_generator import PixelState, gather_cells
+from alpasim_plugin.nets.reference_blend import BlendHeads, mix
 
 
 def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Tensor, Tensor, PixelState]:
@@ -47,3 +48,25 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
     fast, plain = (gather(*views, views[2]) for gather in (gather_cells_cpu, gather_cells))
     assert torch.equal(fast.coarse.nan_to_num(7.0), plain.coarse.nan_to_num(7.0))
     assert torch.equal(fast.fine.nan_to_num(7.0), plain.fine.nan_to_num(7.0))
+
+
+@pytest.mark.parametrize(("batch", "references", "height", "width"), [(1, 1, 16, 16), (2, 3, 32, 48), (1, 4, 16, 80)])
+def test_one_pass_mixes_as_the_operations_one_by_one(batch: int, references: int, height: int, width: int) -> None:
+    draw = torch.Generator().manual_seed(height + references)
+    repaired = torch.rand(batch, height, width, 3, generator=draw) * 2 - 1
+    images = torch.rand(batch, references, height, width, 4, generator=draw)
+    images[..., :3] = images[..., :3] * 2 - 1
+    images[..., 3] = (images[..., 3] * 3).floor() / 2  # 0, one half, 1
+    at2 = (batch, references, height // 2, width // 2)
+    heads = BlendHeads(*(torch.randn(*at2, n, generator=draw) * size for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))))
+    fast, plain = mix_cpu(repaired, images, heads), mix(repaired, images, heads)
+    assert torch.allclose(fast[0], plain[0], atol=2e-5)
+    assert torch.allclose(fast[1], plain[1], atol=2e-5)
+
+
+def test_a_reference_with_an_enormous_weight_is_the_picture_and_nothing_overflows() -> None:
+    repaired, images = torch.zeros(1, 16, 16, 3), torch.ones(1, 2, 16, 16, 4)
+    heads = BlendHeads(torch.full((1, 2, 8, 8, 4), 200.0), torch.zeros(1, 2, 8, 8, 2), torch.zeros(1, 2, 8, 8, 12))
+    out, recorded = mix_cpu(repaired, images, heads)
+    assert torch.allclose(out, torch.ones_like(out), atol=1e-5)
+    assert torch.equal(recorded, torch.ones_like(recorded))
