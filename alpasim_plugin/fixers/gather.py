@@ -1,6 +1,6 @@
 """What a generator in pixels reads and writes, for processors: one pass over the images instead of one for each operation.
 
-`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `mix_cpu` is `nets.reference_blend.mix`.
+`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `gather_beside_cpu` and `mix_cpu` are those of `nets.reference_blend`.
 """
 
 # Numba's decorators are untyped.
@@ -14,8 +14,7 @@ from numba import njit
 from torch import Tensor
 
 from alpasim_plugin.nets.pixel_generator import CELL, DETAIL, DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
-from alpasim_plugin.nets.reference_blend import NOWHERE, BlendHeads
-
+from alpasim_plugin.nets.reference_blend import CHANNELS, NOWHERE, BesideCells, BlendHeads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 
@@ -75,6 +74,38 @@ def _gather_fine(render, opacity, output, fine):
                         for c in range(3):
                             cell[run * r + 3 * k + c] = render[b, y, x, c]
                             cell[three + one + run * r + 3 * k + c] = output[b, y, x, c]
+
+
+def gather_beside_cpu(references: Tensor, render: Tensor) -> BesideCells:
+    """Return the same as `nets.reference_blend.gather_beside`, of float32 tensors on the CPU, to rounding."""
+    b, k, h, w, _ = references.shape
+    sizes = [(n, h // side, w // side, side * side * CHANNELS) for n, side in ((b, CELL), (b, DETAIL), (b * k, CELL), (b * k, DETAIL))]
+    made = BesideCells(*(torch.empty(size) for size in sizes))
+    _gather_beside(np.ascontiguousarray(references.numpy()), np.ascontiguousarray(render.numpy()), *(part.numpy() for part in made))
+    return made
+
+
+@njit(cache=True, nogil=True)
+def _gather_beside(references, render, mean4, mean2, each4, each2):
+    batch, count, height, width, _ = references.shape
+    share = np.float32(1.0) / np.float32(count)
+    for b in range(batch):
+        for y in range(height):
+            i4, i2, r4, r2 = y // CELL, y // DETAIL, (y % CELL) * CELL, (y % DETAIL) * DETAIL
+            for x in range(width):
+                j4, j2 = x // CELL, x // DETAIL
+                at4, at2 = CHANNELS * (r4 + x % CELL), CHANNELS * (r2 + x % DETAIL)
+                for c in range(CHANNELS):
+                    total = np.float32(0.0)
+                    for k in range(count):
+                        value = references[b, k, y, x, 3]
+                        if c < 3:
+                            value *= references[b, k, y, x, c] - render[b, y, x, c]
+                        each4[b * count + k, i4, j4, at4 + c] = value
+                        each2[b * count + k, i2, j2, at2 + c] = value
+                        total += value
+                    mean4[b, i4, j4, at4 + c] = total * share
+                    mean2[b, i2, j2, at2 + c] = total * share
 
 
 def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:

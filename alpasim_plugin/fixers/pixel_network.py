@@ -19,11 +19,11 @@ from torch import Tensor, nn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
-from alpasim_plugin.fixers.gather import gather_cells_cpu, mix_cpu
+from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, mix_cpu
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
 from alpasim_plugin.nets.pixel_generator import GatheredCells, PixelGenerator, PixelSizes, PixelState
-from alpasim_plugin.nets.reference_blend import BlendHeads
+from alpasim_plugin.nets.reference_blend import BesideCells, BlendHeads
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -103,16 +103,17 @@ class RecordedStep:
         self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, references: Tensor | None = None
     ) -> tuple[Tensor, PixelState]:
         """Return the clean frame and the state after it; see `PixelGenerator.forward`."""
-        read = () if references is None or self._step.net.blend is None else (references,)
-        tensors = *gather_cells_cpu(render, opacity, sdmap, state, source), render, *state, *read
-        shape = *render.shape, *(images.shape[1] for images in read)
+        reads = references is not None and self._step.net.blend is not None
+        beside = gather_beside_cpu(references, render) if reads and references is not None else ()
+        tensors = *gather_cells_cpu(render, opacity, sdmap, state, source), render, *state, *beside
+        shape = *render.shape, *(part.shape[0] for part in beside)
         self._calls[shape] += 1
         if self._after is not None and shape not in self.recorded and self._calls[shape] > self._after:
             self.recorded[shape] = _record(self._step, tensors)
         out, hidden, kept, frames, *heads = self.recorded.get(shape, self._step)(*tensors)
         recorded = torch.zeros_like(render[..., :1])
-        if heads:
-            out, recorded = mix_cpu(out, read[0], BlendHeads(*heads))
+        if heads and references is not None:
+            out, recorded = mix_cpu(out, references, BlendHeads(*heads))
         return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames, recorded)
 
 
@@ -125,8 +126,8 @@ class _Step(nn.Module):
 
     def forward(self, coarse: Tensor, fine: Tensor, render: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
         kept = len(PixelState._fields)
-        references = others[kept] if len(others) > kept else None
-        made = self.net.before_blend(GatheredCells(coarse, fine), render, PixelState(*others[:kept]), None, references)
+        beside = BesideCells(*others[kept:]) if len(others) > kept else None
+        made = self.net.before_blend(GatheredCells(coarse, fine), render, PixelState(*others[:kept]), None, beside)
         return (*made[:-1], *(made.heads or ()))
 
 

@@ -99,50 +99,53 @@ def warp_coordinates(
     """
     height, width = depth.shape
     x, y, held = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
-    arrays = (np.ascontiguousarray(a, dtype=np.float64) for a in (K, T_world_camera, K_then, T_then_world, T_box_world, T_then_box, sizes))
+    # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is linear along a row.
+    ray = T_world_camera[:3, :3] @ np.linalg.inv(K)
+    project = K_then @ T_then_world[:3]
+    A, b = project[:, :3] @ ray, project[:, :3] @ T_world_camera[:3, 3] + project[:, 3]
+    arrays = (
+        np.ascontiguousarray(part, dtype=np.float64) for part in (A, b, ray, T_world_camera[:3, 3], project, T_box_world, T_then_box, sizes)
+    )
     _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, x, y, held)
     return x, y, held
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _coordinates(depth, depth_then, K, T, K_then, T_then, T_box, T_then_box, sizes, x, y, held):
+def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, sizes, x, y, held):
     """Fill ``x``, ``y`` and ``held``; the loop of `plain_coordinates`."""
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
     actors = sizes.shape[0]
     for row in range(height):
+        v0 = row + 0.5
         for column in range(width):
-            z = np.float64(depth[row, column])
+            z, u0 = np.float64(depth[row, column]), column + 0.5
             if not z > 0:
                 z = INFINITY_M
-            cx, cy = (column + 0.5 - K[0, 2]) / K[0, 0] * z, (row + 0.5 - K[1, 2]) / K[1, 1] * z
-            px = T[0, 0] * cx + T[0, 1] * cy + T[0, 2] * z + T[0, 3]
-            py = T[1, 0] * cx + T[1, 1] * cy + T[1, 2] * z + T[1, 3]
-            pz = T[2, 0] * cx + T[2, 1] * cy + T[2, 2] * z + T[2, 3]
-            lost = False
-            for a in range(actors):
-                B = T_box[a]
-                qz = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
-                if not -sizes[a, 2] / 2 + SOLE_M <= qz < sizes[a, 2] / 2 + AROUND_M[2]:
-                    continue
-                qx = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
-                qy = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
-                if abs(qx) >= sizes[a, 0] / 2 + AROUND_M[0] or abs(qy) >= sizes[a, 1] / 2 + AROUND_M[1]:
-                    continue
-                W = T_then_box[a]
-                lost = not np.isfinite(W[0, 0])
-                px = W[0, 0] * qx + W[0, 1] * qy + W[0, 2] * qz + W[0, 3]
-                py = W[1, 0] * qx + W[1, 1] * qy + W[1, 2] * qz + W[1, 3]
-                pz = W[2, 0] * qx + W[2, 1] * qy + W[2, 2] * qz + W[2, 3]
-                break
-            if lost:
-                continue
-            rz = T_then[2, 0] * px + T_then[2, 1] * py + T_then[2, 2] * pz + T_then[2, 3]
+            qx = z * (A[0, 0] * u0 + A[0, 1] * v0 + A[0, 2]) + b[0]
+            qy = z * (A[1, 0] * u0 + A[1, 1] * v0 + A[1, 2]) + b[1]
+            rz = z * (A[2, 0] * u0 + A[2, 1] * v0 + A[2, 2]) + b[2]
+            if actors and z < INFINITY_M:
+                px = z * (ray[0, 0] * u0 + ray[0, 1] * v0 + ray[0, 2]) + eye[0]
+                py = z * (ray[1, 0] * u0 + ray[1, 1] * v0 + ray[1, 2]) + eye[1]
+                pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
+                a = _box_around(px, py, pz, T_box, sizes)
+                if a >= 0:
+                    W, B = T_then_box[a], T_box[a]
+                    if not np.isfinite(W[0, 0]):
+                        continue
+                    bx = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
+                    by = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
+                    bz = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
+                    px = W[0, 0] * bx + W[0, 1] * by + W[0, 2] * bz + W[0, 3]
+                    py = W[1, 0] * bx + W[1, 1] * by + W[1, 2] * bz + W[1, 3]
+                    pz = W[2, 0] * bx + W[2, 1] * by + W[2, 2] * bz + W[2, 3]
+                    qx = project[0, 0] * px + project[0, 1] * py + project[0, 2] * pz + project[0, 3]
+                    qy = project[1, 0] * px + project[1, 1] * py + project[1, 2] * pz + project[1, 3]
+                    rz = project[2, 0] * px + project[2, 1] * py + project[2, 2] * pz + project[2, 3]
             if not rz > NEAREST_M:
                 continue
-            rx = T_then[0, 0] * px + T_then[0, 1] * py + T_then[0, 2] * pz + T_then[0, 3]
-            ry = T_then[1, 0] * px + T_then[1, 1] * py + T_then[1, 2] * pz + T_then[1, 3]
-            u, v = rx / rz * K_then[0, 0] + K_then[0, 2], ry / rz * K_then[1, 1] + K_then[1, 2]
+            u, v = qx / rz, qy / rz
             if not (0 <= u < columns_then and 0 <= v < rows_then):
                 continue
             x[row, column], y[row, column] = u - 0.5, v - 0.5
@@ -151,6 +154,21 @@ def _coordinates(depth, depth_then, K, T, K_then, T_then, T_box, T_then_box, siz
                 there = INFINITY_M
             far = there > INFINITY_M / 2 and rz > INFINITY_M / 2
             held[row, column] = HELD if far or abs(there - rz) < SLACK * rz + SLACK_M else DOUBTED
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _box_around(px, py, pz, T_box, sizes):
+    """Return the first box that a point of the world lies in; -1: none."""
+    for a in range(sizes.shape[0]):
+        B = T_box[a]
+        qz = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
+        if not -sizes[a, 2] / 2 + SOLE_M <= qz < sizes[a, 2] / 2 + AROUND_M[2]:
+            continue
+        qx = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
+        qy = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
+        if abs(qx) < sizes[a, 0] / 2 + AROUND_M[0] and abs(qy) < sizes[a, 1] / 2 + AROUND_M[1]:
+            return a
+    return -1
 
 
 def plain_coordinates(

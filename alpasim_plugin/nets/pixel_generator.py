@@ -35,7 +35,7 @@ from alpasim_plugin.nets.pixel_layers import (
     repeat_per_pixel,
     small,
 )
-from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BlendHeads, ReferenceBlend, beside_render, mix
+from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BesideCells, BlendHeads, ReferenceBlend, gather_beside, mix
 
 GRID_PX = 16  # sides are multiples of it
 IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
@@ -207,21 +207,20 @@ class PixelGenerator(nn.Module):
         self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, references: Tensor | None = None
     ) -> tuple[Tensor, PixelState]:
         """Predict the clean frame from what `gather_cells` gathered; see `forward`."""
-        made = self.before_blend(gathered, render, state, t, references)
+        beside = None if self.blend is None or references is None else gather_beside(references, render)
+        made = self.before_blend(gathered, render, state, t, beside)
         out, recorded = made.repaired, torch.zeros_like(render[..., :1])
         if made.heads is not None and references is not None:
             out, recorded = mix(made.repaired, references, made.heads)
         return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
 
     def before_blend(
-        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, references: Tensor | None = None
+        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, beside: BesideCells | None = None
     ) -> BeforeBlend:
-        """Run the network up to the blend of its picture with the references; see `forward`."""
+        """Run the network up to the blend of its picture with the references, which `gather_beside` gathered; see `forward`."""
         dtype = self.stem.weight.dtype
         stem, read = self.stem(gathered.coarse.to(dtype)), self.read(gathered.fine.to(dtype))
-        beside = None
-        if self.blend is not None and references is not None:
-            beside = beside_render(references, render)
+        if self.blend is not None and beside is not None:
             at4, at2 = self.blend.features(beside)
             stem, read = stem + at4, read + at2
         x4 = self.encode4(self.mix(activation(stem, inplace=True)))

@@ -29,6 +29,15 @@ NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarit
 DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
 
 
+class BesideCells(NamedTuple):
+    """What references show beside the render, ``(ref - render) v`` and ``v``, as `cells`; float32."""
+
+    mean4: Tensor  # (B, H / 4, W / 4, 64) the mean over the references
+    mean2: Tensor  # (B, H / 2, W / 2, 16)
+    each4: Tensor  # (B K, H / 4, W / 4, 64)
+    each2: Tensor  # (B K, H / 2, W / 2, 16)
+
+
 class BlendHeads(NamedTuple):
     """How references enter the picture, at half its resolution; float32."""
 
@@ -65,32 +74,25 @@ class ReferenceBlend(nn.Module):
         with torch.no_grad():
             self.write.bias[: DETAIL**2] = DOUBT
 
-    def features(self, beside: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the references add to the generator's first layers.
+    def features(self, beside: BesideCells) -> tuple[Tensor, Tensor]:
+        """Return what the references add to the first layers: ``(B, H / 4, W / 4, coarse)`` and ``(B, H / 2, W / 2, detail)``."""
+        dtype = self.stem.weight.dtype
+        return self.stem(beside.mean4.to(dtype)), self.read(beside.mean2.to(dtype))
 
-        Args:
-            beside: ``(B, K, H, W, 4)`` from `beside_render`.
-
-        Returns:
-            ``(B, H / 4, W / 4, coarse)`` and ``(B, H / 2, W / 2, detail)``: means over the references.
-        """
-        mean = beside.mean(dim=1).to(self.stem.weight.dtype)
-        return self.stem(cells(mean, CELL)), self.read(cells(mean, DETAIL))
-
-    def forward(self, y: Tensor, fine: Tensor, beside: Tensor) -> BlendHeads:
+    def forward(self, y: Tensor, fine: Tensor, beside: BesideCells) -> BlendHeads:
         """Say how every reference enters the picture.
 
         Args:
             y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
-            beside: ``(B, K, H, W, 4)`` from `beside_render`.
+            beside: What the references show beside the render.
         """
-        b, k = beside.shape[:2]
-        each = beside.flatten(0, 1).to(fine.dtype)
-        at4 = activation(_repeated(y, k) + self.coarse(cells(each, CELL)), inplace=True)
+        b = y.shape[0]
+        k = beside.each4.shape[0] // b
+        at4 = activation(_repeated(y, k) + self.coarse(beside.each4.to(y.dtype)), inplace=True)
         for conv in self.align:
             at4 = activation(conv(at4), inplace=True)
-        joined = _repeated(fine, k) + self.own(cells(each, DETAIL)) + self.up(at4)
+        joined = _repeated(fine, k) + self.own(beside.each2.to(fine.dtype)) + self.up(at4)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
         weight, offset, correction = said.unflatten(0, (b, k)).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
         seen_at4 = F.interpolate(self.shift(at4).float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
@@ -120,10 +122,17 @@ def mix(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor
     return out, 1 - shares[:, 0]
 
 
-def beside_render(references: Tensor, render: Tensor) -> Tensor:
-    """Return what the network reads of references: ``(ref - render) v`` and ``v``, ``(B, K, H, W, 4)``."""
+def gather_beside(references: Tensor, render: Tensor) -> BesideCells:
+    """Put what the network reads of references side by side.
+
+    Args:
+        references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds v, 0 to 1.
+        render: ``(B, H, W, 3)`` in [-1, 1].
+    """
     holds = references[..., 3:]
-    return torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
+    each = torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
+    mean, flat = each.mean(dim=1), each.flatten(0, 1)
+    return BesideCells(cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL))
 
 
 def _repeated(x: Tensor, times: int) -> Tensor:
