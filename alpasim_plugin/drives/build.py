@@ -18,7 +18,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Box, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
+from alpasim_plugin.drives.placing import PlacedDrive, corridor, given_map, place
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
 from alpasim_plugin.drives.sfm import forget
@@ -96,7 +96,7 @@ def import_drive(
         key = key_of(drive, camera_height_m, lane_map)
         if out.exists():
             return finished(out, key)
-        quality = _built(drive, folder, work, key, camera_height_m, tell)
+        quality = _built(drive, folder, work, key, camera_height_m, lane_map, tell)
     except InputError:  # it would be the same again: nothing is kept to go on from
         forget(found)
         forget(work)
@@ -106,19 +106,23 @@ def import_drive(
     return quality
 
 
-def _built(drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, tell: Report) -> dict[str, Any]:
+def _built(
+    drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, map_file: Path | None, tell: Report
+) -> dict[str, Any]:
     """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
+    roads, notes = given_map(map_file, drive, placed) if map_file else (corridor(placed.ego, placed.ground), ())
+    drive = replace(drive, notes=(*drive.notes, *notes))
     shown = shown_photographs(drive, placed)
     begin(work, key)
     write_photographs(work, shown, tell)
     views = {use: [one.view() for one in shown if one.use == use] for use in ("fitted", "held-out", "never-fitted")}
     boxes = {actor.actor_id: actor.box for actor in placed.tracks}
     model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id_of(drive), work / FIT_FOLDER, tell)
-    quality = write_folder(work, drive, placed, model, shown, views, exposures, tell)
+    quality = write_folder(work, drive, placed, roads, model, shown, views, exposures, tell)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
 
@@ -127,6 +131,7 @@ def write_folder(
     work: Path,
     drive: SourceDrive,
     placed: PlacedDrive,
+    roads: LaneMap,
     model: Reconstruction,
     shown: Sequence[Shown],
     views: Mapping[str, Sequence[PosedView]],
@@ -138,6 +143,7 @@ def write_folder(
     Args:
         work: The folder.
         drive, placed: The recording, as read and in the world.
+        roads: Its map, or the corridor.
         model: Its reconstruction.
         shown: The photographs, which lie in the folder.
         views: Use of the photographs to them as views; of the fitted ones only the cameras matter.
@@ -150,7 +156,7 @@ def write_folder(
     scene_id = scene_id_of(drive)
     model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
     standing = standing_obstacles(model.background, placed.points, placed.ground, placed.ego, Vehicle())
-    log = _log(drive, placed, corridor(placed.ego, placed.ground), scene_id)
+    log = _log(drive, placed, roads, scene_id)
     write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
     _write_transforms(work, shown, exposures)
     write_drive(work, log, placed.tracks, standing.obstacles)
@@ -161,7 +167,7 @@ def write_folder(
 
 def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
     """Return what identifies an import: the pictures by size and time of change, their poses and lenses, and the options."""
-    digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and lane_map.read_bytes())).encode())
+    digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map, DOING))).encode())
     for one in drive.pictures:
         status = one.file.stat() if one.file.is_file() else None
         digest.update(f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode())
