@@ -67,7 +67,7 @@ def read_unposed(path: Path, work: Path, tell: Report) -> SourceDrive:
     across = 2 * np.degrees(np.arctan(0.5 * lens.width / lens.K[0, 0]))
     notes += [
         f"poses and lens found by structure from motion: {len(known)} of {len(times)} photographs, {len(drive.points or ())} points",
-        f"the lens was found to see {across:.0f} degrees across; driving straight on leaves that, and with it lengths along the way, nearly "
+        f"the lens was found to see {across:.0f} degrees across; driving straight on leaves that, and lengths along the way, nearly "
         "free: poses of a calibrated camera know it",
     ]
     return replace(drive, scene_id=path.stem, pictures=pictures, notes=tuple(notes))
