@@ -119,6 +119,7 @@ def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: 
         "coverage": [{"aside_m": aside, "share": round(share, 4)} for aside, share in measured.coverage.items()],
         "obstacles": _obstacle_facts(measured.standing),
         **placed.facts,
+        "T_world_source": placed.T_world_source.tolist(),
         "notes": [*drive.notes, *placed.notes],
     }
     write_json(folder / "quality.json", quality)

@@ -185,3 +185,12 @@ def test_photographs_without_poses_name_the_extra_where_it_is_missing(tmp_path: 
         import_drive(tmp_path / "photos", tmp_path / "out")
     assert "[sfm]" in caught.value.do_this
     assert not (tmp_path / ".out.poses").exists()
+
+
+def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path: Path, walk: Path) -> None:
+    folder = Path(shutil.copytree(walk, tmp_path / "walk"))
+    document = json.loads((folder / "transforms.json").read_text())
+    document["frames"] = [frame for _ in range(30) for frame in document["frames"]]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="720 photographs"):
+        import_drive(folder, tmp_path / "out")
