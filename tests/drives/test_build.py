@@ -135,3 +135,18 @@ def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(imported: Path, tm
     assert np.allclose(scene.ego_log.xyz, scenario.ego_log.xyz)
     assert len(scene.lane_map.lanes) == 1
     assert len(scene.actors) == len(scenario.actors)
+
+
+def test_policies_drive_behind_the_reconstruction_and_clean_is_refused(
+    imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = str(imported / "scenario.yaml")
+    short = ["--set", "timing.duration_us=700000", "--certify", "none", "--workers", "1", "--no-report", "--json"]
+    assert run_command(["--renderer", "3dgs", "--policy", "log-replay", scenario, "--out", str(tmp_path / "run"), *short]) == 0
+    told = json.loads(capsys.readouterr().out)
+    metrics = told["metrics"]["3dgs"] if "metrics" in told else json.loads((tmp_path / "run/summary.json").read_text())["metrics"]["3dgs"]
+    assert metrics["collision_standing"]["mean"] == 0.0
+    assert metrics["collision_any"]["mean"] == 0.0
+    assert metrics["offroad"]["mean"] == 0.0
+    assert run_command(["--renderer", "clean", "--policy", "log-replay", scenario, "--out", str(tmp_path / "no"), *short]) != 0
+    assert "nothing was built" in capsys.readouterr().out + str([path.read_text() for path in (tmp_path / "no").rglob("manifest.json")])
