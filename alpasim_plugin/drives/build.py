@@ -19,7 +19,7 @@ from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, corridor, given_map, place
+from alpasim_plugin.drives.placing import NO_MAP, PlacedDrive, corridor, given_map, place
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
 from alpasim_plugin.drives.sfm import forget
@@ -118,7 +118,7 @@ def _built(
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
-    roads, notes = given_map(map_file, drive, placed) if map_file else (corridor(placed.ego, placed.ground), ())
+    roads, notes = given_map(map_file, drive, placed) if map_file else (corridor(placed.ego, placed.ground), (NO_MAP,))
     drive = replace(drive, notes=(*drive.notes, *notes))
     shown = shown_photographs(drive, placed)
     begin(work, key)
@@ -164,7 +164,7 @@ def write_folder(
     write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
     _write_transforms(work, shown, exposures)
     write_drive(work, log, [_from_start(one, int(placed.ego.t_us[0])) for one in placed.tracks], standing.obstacles)
-    quality = write_page(work, drive, placed, measure(model, views, placed, standing, tell))
+    quality = write_page(work, drive, placed, measure(model, views, exposures, placed, standing, tell))
     write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, drive.scene_id))
     return quality
 

@@ -225,6 +225,9 @@ def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:
     }  # fmt: skip
 
 
+NO_MAP = "no map: the road is the driven path, 3.5 m wide, without paint"
+
+
 def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     """Return the driven path as one lane of usual width, without paint: nothing says where lines were."""
     xy = ego.xyz[:, :2]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, Actor, Trajectory
+from alpasim_plugin.core.types import F64, Actor, Bool, Trajectory
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
 DOING = "importing a drive"
@@ -40,8 +40,8 @@ class Points:
         """Return them in another frame; ``(4, 4)``, may scale."""
         return Points(self.xyz @ T[:3, :3].T + T[:3, 3], self.rgb, T[:3, :3] @ self.covariance @ T[:3, :3].T)
 
-    def chosen(self, which: F64) -> Points:
-        """Return those that a mask or indices choose."""
+    def chosen(self, which: Bool) -> Points:
+        """Return those that a mask ``(N,)`` chooses."""
         return Points(self.xyz[which], self.rgb[which], self.covariance[which])
 
     def joined(self, other: Points) -> Points:
