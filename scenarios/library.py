@@ -50,6 +50,13 @@ def find(path_or_name: str | Path) -> Path:
 
 def unknown(doing: str, text: str, kind: str, names: Mapping[str, Path]) -> InputError:
     """Make the error for a text that is neither a path nor one of the shipped names, with the nearest of these."""
+    try:
+        Path(text).stat()
+    except PermissionError as error:  # it may be there
+        found = f"{error.strerror}: a folder on the way to it may not be searched"
+        return InputError(doing, text, found, "let this user search and read it")
+    except (OSError, ValueError):
+        pass
     name = text.removesuffix(".yaml")
     near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     if not near:

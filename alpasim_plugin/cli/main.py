@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.installed import installed_names
+from alpasim_plugin.io import places
 from alpasim_plugin.process.signals import Stopped, leave_at_once, stoppable
 
 if TYPE_CHECKING:
@@ -220,6 +221,10 @@ def _unforeseen(error: Exception, args: list[str]) -> SimrunError:
         return InfrastructureError(
             "running a command", command, f"{error.strerror}: {where}", "free space, then give the same command again"
         )
+    if isinstance(error, PermissionError) and error.filename:
+        return InputError("running a command", str(error.filename), str(error.strerror), "let this user read and write it, or name another")
+    if isinstance(error, OSError) and places.nothing_is_writable():  # of a library that needs a folder for itself
+        return InfrastructureError("running a command", command, f"no folder can be written: {error}", places.DO_THIS)
     failure = InternalError.of(error, command)
     failure.__cause__ = error
     return failure

@@ -104,13 +104,18 @@ def prepare() -> None:
         os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
 
 
+def nothing_is_writable() -> bool:
+    """Tell whether `prepare` found no folder at all that this process can write."""
+    return INTERPRETED in _notes
+
+
 def require_kernels() -> None:
-    """Refuse to compute where kernels cannot be compiled: it would take a thousand times as long.
+    """Refuse to compute where kernels cannot be compiled: it would take a thousand times as long, and some cannot run.
 
     Raises:
         InfrastructureError: `prepare` found no folder for them.
     """
-    if INTERPRETED in _notes:
+    if nothing_is_writable():
         raise InfrastructureError("compiling kernels", "the cache of kernels", "no folder can be written", DO_THIS)
 
 

@@ -39,6 +39,7 @@ from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
+from alpasim_plugin.io.places import require_kernels
 
 
 class Buffers(threading.local):
@@ -83,7 +84,9 @@ def rasterize_prepared(
 
     Raises:
         InputError: A transform is not rigid or the background does not fit.
+        InfrastructureError: Kernels cannot be compiled: no folder can be written.
     """
+    require_kernels()
     threads = thread_count(threads)
     behind = background_image(background, camera)
     view = camera_numbers(camera, lod_px)
