@@ -40,7 +40,6 @@ DRIVE_FILE, TRANSFORMS_FILE, GROUND_FILE, MODEL_FOLDER = "drive.json", "transfor
 DOING = "reading an imported drive"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
 VERSION = 1
-OBSTACLE = "obstacle-"  # first part of the ids of standing obstacles that were found in the model, not tracked
 Numbers, Rows = list[float], list[list[float]]
 
 
@@ -156,7 +155,7 @@ class Obstacle:
     """Something that stands in the model and can be hit, as an upright box.
 
     Attributes:
-        obstacle_id: Begins with `OBSTACLE`.
+        obstacle_id: Begins with `STANDING_ID`.
         box: Its full sizes, metres.
         xyz: ``(3,)`` the box's middle, metres, world.
         yaw_rad: Turned from east to the left.

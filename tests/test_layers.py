@@ -23,6 +23,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     A + "nets": (),
     A + "semantic_map": (A + "gaussians",),
     A + "renderers": (A + "gaussians", A + "world"),
+    A + "drives": (A + "gaussians", A + "world", "scenarios"),
     A + "fixers": (A + "gaussians", A + "world", A + "nets", A + "semantic_map"),
     "policies": (),
     A + "control": (),

@@ -43,13 +43,16 @@ def drive(
     camera_height: Annotated[
         float | None, Flag("Front camera above the ground, metres, where poses have no unit.", min=0.1, max=5.0)
     ] = None,
+    road: Annotated[
+        Path | None, Flag("OpenDRIVE map in the coordinates of the poses; by default the driven path is the road.", "--map")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Make a scenario of a recorded drive: photographs with poses become a street in which policies drive."""
     began = time.perf_counter()
     with _progress(as_json) as tell:
         try:
-            quality = import_drive(folder, out, camera_height, None, tell)
+            quality = import_drive(folder, out, camera_height, road, tell)
         except Stopped as stop:
             stop.kept = "the same command goes on where it stopped"
             raise

@@ -270,6 +270,8 @@ class BackgroundFile:
 
 Standing = Literal["known", "found", "unknown"]  # what stands there: all among the actors; found in a reconstruction; not looked for
 
+STANDING_ID = "obstacle-"  # ids of actors found in a reconstruction begin so: it shows them, nobody draws them once more
+
 
 @dataclass(frozen=True)
 class Scene:

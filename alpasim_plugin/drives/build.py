@@ -12,22 +12,23 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
-from alpasim_plugin.drives.correcting import with_corrected_poses
-from alpasim_plugin.drives.fitting import fitted
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
-from alpasim_plugin.drives.points import triangulated
+from alpasim_plugin.drives.placing import NO_MAP, PlacedDrive, corridor, given_map, place
+from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
-from alpasim_plugin.drives.road_points import road_points
 from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
+from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.io.reading import read_bytes, read_json
@@ -38,6 +39,8 @@ SCENARIO_FILE, KEY_FILE, FIT_FOLDER, POINTS_FILE = "scenario.yaml", "import.json
 EVERY = 8  # one photograph of so many is held out
 FIT_PX = 608  # least width of fitted views; half of the photograph's where that is more
 RENDER_PX, SIDE_PX = 640, 16  # most width of the scenario's cameras; what their sides are multiples of, as fixers need
+SEED = 0  # of the fit
+HELD_US = 150_000  # cameras and the sensor that tracks are not triggered at once
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
 Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
 
@@ -52,6 +55,7 @@ class Shown:
         use: ``fitted``, ``held-out`` or ``never-fitted``.
         T_world_camera: ``(4, 4)``.
         file: Where it lies in the imported folder.
+        actors: Poses of the tracked road users when it was taken, ``T_world_box (4, 4)``.
     """
 
     picture: Picture
@@ -59,13 +63,14 @@ class Shown:
     use: str
     T_world_camera: F64
     file: str
+    actors: Mapping[str, F64]
 
     def view(self) -> PosedView:
         """Return it as a view of the width that is fitted."""
         full = replace(self.picture, T_world_camera=self.T_world_camera).view()
         width = max(min(full.camera.width, FIT_PX), -(-full.camera.width // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
-        return replace(small, name=f"{self.camera}-{self.picture.file.stem}")
+        return replace(small, name=f"{self.camera}-{self.picture.file.stem}", actors=self.actors)
 
 
 def import_drive(
@@ -95,7 +100,7 @@ def import_drive(
         key = key_of(drive, camera_height_m, lane_map)
         if out.exists():
             return finished(out, key)
-        quality = _built(drive, folder, work, key, camera_height_m, tell)
+        quality = _built(drive, folder, work, key, camera_height_m, lane_map, tell)
     except InputError:  # it would be the same again: nothing is kept to go on from
         forget(found)
         forget(work)
@@ -105,19 +110,23 @@ def import_drive(
     return quality
 
 
-def _built(drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, tell: Report) -> dict[str, Any]:
+def _built(
+    drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, map_file: Path | None, tell: Report
+) -> dict[str, Any]:
     """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
+    roads, notes = given_map(map_file, drive, placed) if map_file else (corridor(placed.ego, placed.ground), (NO_MAP,))
+    drive = replace(drive, notes=(*drive.notes, *notes))
     shown = shown_photographs(drive, placed)
     begin(work, key)
     write_photographs(work, shown, tell)
     views = {use: [one.view() for one in shown if one.use == use] for use in ("fitted", "held-out", "never-fitted")}
     boxes = {actor.actor_id: actor.box for actor in placed.tracks}
     model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id_of(drive), work / FIT_FOLDER, tell)
-    quality = write_folder(work, drive, placed, model, shown, views, exposures, tell)
+    quality = write_folder(work, drive, placed, roads, model, shown, views, exposures, tell)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
 
@@ -126,6 +135,7 @@ def write_folder(
     work: Path,
     drive: SourceDrive,
     placed: PlacedDrive,
+    roads: LaneMap,
     model: Reconstruction,
     shown: Sequence[Shown],
     views: Mapping[str, Sequence[PosedView]],
@@ -137,6 +147,7 @@ def write_folder(
     Args:
         work: The folder.
         drive, placed: The recording, as read and in the world.
+        roads: Its map, or the corridor.
         model: Its reconstruction.
         shown: The photographs, which lie in the folder.
         views: Use of the photographs to them as views; of the fitted ones only the cameras matter.
@@ -149,18 +160,18 @@ def write_folder(
     scene_id = scene_id_of(drive)
     model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
     standing = standing_obstacles(model.background, placed.points, placed.ground, placed.ego, Vehicle())
-    log = _log(drive, placed, corridor(placed.ego, placed.ground), scene_id)
+    log = _log(drive, placed, roads, scene_id)
     write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
     _write_transforms(work, shown, exposures)
-    write_drive(work, log, placed.tracks, standing.obstacles)
-    quality = write_page(work, drive, placed, measure(model, views, placed, standing, tell))
+    write_drive(work, log, [_from_start(one, int(placed.ego.t_us[0])) for one in placed.tracks], standing.obstacles)
+    quality = write_page(work, drive, placed, measure(model, views, exposures, placed, standing, tell))
     write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, drive.scene_id))
     return quality
 
 
 def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
     """Return what identifies an import: the pictures by size and time of change, their poses and lenses, and the options."""
-    digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and lane_map.read_bytes())).encode())
+    digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map, DOING))).encode())
     for one in drive.pictures:
         status = one.file.stat() if one.file.is_file() else None
         digest.update(f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode())
@@ -212,8 +223,15 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
             use = "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
             ending = one.file.suffix.lower() if not one.lens.bends else ".png"
             picture = replace(one, t_us=int(one.t_us or 0) - first_us)
-            out.append(Shown(picture, name, use, placed.poses[camera][i], f"photographs/{name}/{i:06d}{ending}"))
+            there = _tracked_at(placed.tracks, int(one.t_us or 0))
+            out.append(Shown(picture, name, use, placed.poses[camera][i], f"photographs/{name}/{i:06d}{ending}", there))
     return out
+
+
+def _tracked_at(tracks: Sequence[Actor], t_us: int) -> dict[str, F64]:
+    """Return where tracked road users are; just before and after what was tracked they stand where they were."""
+    near = [one for one in tracks if one.track.t_us[0] - HELD_US <= t_us <= one.track.t_us[-1] + HELD_US]
+    return {one.actor_id: interpolate(one.track, int(np.clip(t_us, one.track.t_us[0], one.track.t_us[-1]))) for one in near}
 
 
 def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
@@ -245,12 +263,17 @@ def _write_transforms(work: Path, shown: Sequence[Shown], exposures: Mapping[str
 def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str) -> RecordedLog:
     first_us = int(placed.ego.t_us[0])
     ego = replace(placed.ego, t_us=placed.ego.t_us - first_us)
-    origin = placed.T_world_source[:3, 3]
+    only_moved = drive.metric is not None and np.allclose(placed.T_world_source[:3, :3], np.eye(3))
+    origin = placed.T_world_source[:3, 3] if only_moved else np.zeros(3)  # a turned frame has no origin to subtract
     cameras = [_camera(drive, placed, name) for name in drive.cameras if name not in drive.never_fitted and name in placed.mounts]
     return RecordedLog(
         scene_id, "drive", roads, placed.ground, ego, Vehicle(), (), tuple(cameras), (-origin[0], -origin[1], -origin[2]), "",
         notes=(*drive.notes, *placed.notes),
     )  # fmt: skip
+
+
+def _from_start(actor: Actor, first_us: int) -> Actor:
+    return replace(actor, track=replace(actor.track, t_us=actor.track.t_us - first_us))
 
 
 def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
@@ -280,3 +303,41 @@ def _scenario_text(scene_id: str, log: RecordedLog, name: str) -> str:
         f"# A recorded drive, imported from {name}; quality.md says how good it is.\n"
         f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
     )
+
+
+def fitted(
+    views: Sequence[PosedView],
+    kept: Sequence[PosedView],
+    points: Points,
+    boxes: Mapping[str, Box],
+    scene_id: str,
+    folder: Path,
+    tell: Report,
+) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
+    """Fit a model to views.
+
+    Args:
+        views: To fit to.
+        kept: Held out, to measure with on the way.
+        points: To start from.
+        boxes: Sizes of the road users that views may show.
+        scene_id: Key of the random streams.
+        folder: Keeps the fit's state; the same call goes on from it.
+        tell: Called as the fit goes on.
+
+    Returns:
+        The model, and the exposure of each view by its name.
+    """
+    torch.set_num_threads(1)
+    near = points.chosen(np.asarray(points.spread < np.percentile(points.spread, 90)))
+    start = cloud_from_points(near.xyz, near.rgb)
+    done = fit_drive(
+        views, start, kept=kept, boxes=boxes, scene_id=scene_id, folder=folder, seed=SEED,
+        report=lambda stage, at, all, numbers: tell(_words(stage, numbers), at, all),
+    )  # fmt: skip
+    return done.model, dict(done.exposures)
+
+
+def _words(stage: str, numbers: Mapping[str, float]) -> str:
+    """Return a stage with how well held-out photographs are shown, where that was just measured."""
+    return f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB" if "held_out_db" in numbers else stage

@@ -12,12 +12,12 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.geometry import matrix_from_quat
-from alpasim_plugin.core.types import F64, Bool, Box, HeightField, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, STANDING_ID, Bool, Box, HeightField, Trajectory, Vehicle
 from alpasim_plugin.drives.ground import PathFrame
 from alpasim_plugin.drives.source import Points
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.world.ground import height_at
-from scenarios.drive import OBSTACLE, Obstacle
+from scenarios.drive import Obstacle
 
 LOW_M, HIGH_M = 0.3, 2.0  # above the ground: below is kerb and grass, above a car passes
 OPAQUE, LARGEST_M = 0.3, 0.6  # of a Gaussian that counts; larger ones are background, or blur
@@ -126,6 +126,6 @@ def _boxes(at: F64, label: F64, tops: F64, frame: PathFrame, ground: HeightField
             spread = float(np.median(points.spread[close])) if close else UNSEEN_M
         uncertainty = round(float(np.hypot(CELL_M / 2, spread)), 2)
         box = Box(float(np.ptp(u)) + 2 * half, float(np.ptp(v)) + 2 * half, top)
-        name = f"{OBSTACLE}{len(out) + 1:03d}-within-{uncertainty:g}m"
+        name = f"{STANDING_ID}{len(out) + 1:03d}-within-{uncertainty:g}m"
         out.append(Obstacle(name, box, np.array([*middle, base + top / 2]), float(np.arctan2(along[1], along[0])), uncertainty))
     return out

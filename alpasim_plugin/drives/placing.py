@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import scipy
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, inverse, matrix_from_quat, se3, trajectory_from_poses
 from alpasim_plugin.core.types import F64, Actor, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
-from alpasim_plugin.drives.source import Points, SourceDrive
+from alpasim_plugin.drives.source import DOING, Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
+from scenarios.opendrive import lane_map_of
+from scenarios.opendrive_road import parse_map
+from scenarios.reading import SourceFiles
 
 CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
 AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car
+OFF_THE_MAP_M = 5.0  # from the nearest lane, on the median
 LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = 3.5, 8.0, 15.0, 1.0  # of the corridor: width, how far it goes on, distance of vertices
 
 
@@ -218,6 +225,9 @@ def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:
     }  # fmt: skip
 
 
+NO_MAP = "no map: the road is the driven path, 3.5 m wide, without paint"
+
+
 def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     """Return the driven path as one lane of usual width, without paint: nothing says where lines were."""
     xy = ego.xyz[:, :2]
@@ -242,3 +252,35 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
 
 def _heading(ego: Trajectory) -> F64:
     return np.asarray(matrix_from_quat(ego.quat[0])[:2, 0])
+
+
+def given_map(path: Path, drive: SourceDrive, placed: PlacedDrive) -> tuple[LaneMap, tuple[str, ...]]:
+    """Read an OpenDRIVE map in the drive's own coordinates, lay it onto the ground that was found, and return it with notes.
+
+    Raises:
+        InputError: The drive has no metres, the file is no map, or it lies elsewhere than the drive; then the offset is named.
+    """
+    if drive.metric is None:
+        raise InputError(DOING, str(path), "a map in metres for poses without a unit", "give poses in metres, in the map's coordinates")
+    files = SourceFiles(DOING)
+    odr = parse_map(files, path, files.read_xml(path))
+    lane_map, notes = lane_map_of(files, path, odr, placed.T_world_source)
+    centres = np.concatenate([lane.centre for lane in lane_map.lanes.values() if lane.kind == "vehicle"])
+    away, nearest = scipy.spatial.KDTree(centres[:, :2]).query(placed.ego.xyz[:, :2])
+    if np.median(away) > OFF_THE_MAP_M:
+        dx, dy = np.linalg.inv(placed.T_world_source)[:2, :2] @ np.median(centres[nearest, :2] - placed.ego.xyz[:, :2], axis=0)
+        found = f"its nearest lane lies {np.median(away):.1f} m from the drive: {dx:+.1f} m in x and {dy:+.1f} m in y"
+        raise InputError(DOING, str(path), found, "give the map of this street, in the coordinates of the poses")
+
+    def laid(line: F64) -> F64:
+        return np.column_stack([line[:, :2], height_at(placed.ground, line)])
+
+    lanes = {key: replace(
+        lane, centre=laid(lane.centre), left=None if lane.left is None else laid(lane.left),
+        right=None if lane.right is None else laid(lane.right),
+    ) for key, lane in lane_map.lanes.items()}  # fmt: skip
+    edges = tuple(laid(edge) for edge in lane_map.road_edges)
+    return replace(lane_map, lanes=lanes, road_edges=edges), (
+        f"the road is that of {path.name}, laid onto the ground that was found",
+        *notes,
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.core.image_metrics import psnr_db, ssim
+from alpasim_plugin.core.types import F32, F64, U8
 from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
-from alpasim_plugin.gaussians.fit.quality import Comparison, compare
+from alpasim_plugin.gaussians.fit.balance import gain_between
+from alpasim_plugin.gaussians.fit.quality import Comparison
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
@@ -39,28 +41,45 @@ class Measured:
         coverage: Metres beside the path to the share of the lower half of the picture that the model covers.
         plan: ``(H, W, 3)`` uint8, the drive from above.
         standing: Obstacles.
+        fitted: How many photographs the model was fitted to.
     """
 
     rows: Mapping[str, Sequence[Comparison]]
     coverage: Mapping[float, float]
     plan: U8
     standing: Standing
+    fitted: int
 
 
 def measure(
-    model: Reconstruction, views: Mapping[str, Sequence[PosedView]], placed: PlacedDrive, standing: Standing, tell: Report
+    model: Reconstruction,
+    views: Mapping[str, Sequence[PosedView]],
+    exposures: Mapping[str, tuple[float, float, float]],
+    placed: PlacedDrive,
+    standing: Standing,
+    tell: Report,
 ) -> Measured:
-    """Render the model where photographs were taken that it did not see, and beside the path."""
+    """Render the model where photographs were taken that it did not see, in the exposure of those near by, and beside the path."""
     graph = model.graph()
+    known = [view for view in views["fitted"] if view.name in exposures]
+    centres = np.array([view.camera.centre_world for view in known]).reshape(-1, 3)
+    gains = np.array([exposures[view.name] for view in known]).reshape(-1, 3)
     rows = {}
     for use in ("held-out", "never-fitted"):
         chosen = [views[use][i] for i in _spread(len(views[use]), 12)]
         if chosen:
             tell(f"measuring {use} photographs", 0, 1)
-            rows[use] = compare(graph, chosen)
+            rows[use] = [_compared(graph, view, gain_between(centres, gains, view.camera.centre_world)) for view in chosen]
     some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
     coverage = {aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M}
-    return Measured(rows, coverage, _plan(placed, standing.obstacles), standing)
+    return Measured(rows, coverage, _plan(placed, standing.obstacles), standing, len(views["fitted"]))
+
+
+def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
+    known = {name: T for name, T in view.actors.items() if name in graph.actors}
+    out = graph.render(view.camera, known)
+    shown = replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0)).to_uint8()
+    return Comparison(view.name, shown, view.rgb, psnr_db(shown, view.rgb), ssim(shown, view.rgb))
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -115,10 +134,13 @@ def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: 
     quality = {
         "source": drive.kind,
         "photographs": {use: len(rows) for use, rows in measured.rows.items()},
+        "fitted": measured.fitted,
+        "tracks": len(placed.tracks),
         **{use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")} for use, rows in measured.rows.items()},
         "coverage": [{"aside_m": aside, "share": round(share, 4)} for aside, share in measured.coverage.items()],
         "obstacles": _obstacle_facts(measured.standing),
         **placed.facts,
+        "T_world_source": placed.T_world_source.tolist(),
         "notes": [*drive.notes, *placed.notes],
     }
     write_json(folder / "quality.json", quality)
@@ -144,7 +166,14 @@ def _write(path: Path, rgb: U8) -> None:
 def _page(drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[str, Comparison, str]]) -> str:
     lines = [f"# Quality of {drive.scene_id}", "", "## What is missing or assumed", ""]
     lines += [f"- {note}" for note in quality["notes"]]
-    lines += ["", "## Photographs that the fit never saw", "", "| photographs | number | PSNR, dB | SSIM |", "|---|---|---|---|"]
+    lines += ["- no tracks of other road users: nobody moves"] if not quality["tracks"] else []
+    lines += [
+        "",
+        f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",
+        "",
+        "| photographs | number | PSNR, dB | SSIM |",
+        "|---|---|---|---|",
+    ]
     for use, count in quality["photographs"].items():
         lines.append(f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |")
     lines += ["", "## Coverage of the lower half of the picture", "", "| metres to the left of the path | covered |", "|---|---|"]
@@ -159,11 +188,12 @@ def _page(drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[
             f"Ground: {ground['points']} points, camera {ground['camera_height_m']:.2f} m above it; against them by section: {errors}.",
         ]
     found = quality["obstacles"]
+    sides = f", whose sides are known to {found['uncertainty_m']} m (median)" if found["boxes"] else ""
     lines += [
         "",
-        f"Standing obstacles: {found['boxes']} boxes, whose sides are known to {found['uncertainty_m']} m (median). Of the path that was",
+        f"Standing obstacles: {found['boxes']} boxes{sides}. On the driven path {found['cleared_cells']} cells of 0.2 m were opaque",
     ]
-    lines += [f"driven, {found['cleared_cells']} cells of 0.2 m were opaque by mistake and were taken as free."]
+    lines += ["by mistake and were taken as free."]
     lines += ["", "## From above", "", f"![from above]({PICTURES}/plan.png)", "", "## Photograph above, reconstruction below"]
     for use, row, name in shown:
         lines += ["", f"{use}, {row.name}: {row.psnr_db:.2f} dB", "", f"![{row.name}]({name})"]

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, Actor, Trajectory
+from alpasim_plugin.core.types import F64, Actor, Bool, Trajectory
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
 DOING = "importing a drive"
 JUMP = 12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
-STANDING = 0.02  # a drive shorter than this share of what it looks at shows nothing from two sides
 LEAST_M = 1.0
-FEWEST = 8
+FEWEST, MOST = 8, 400  # photographs of a camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +40,8 @@ class Points:
         """Return them in another frame; ``(4, 4)``, may scale."""
         return Points(self.xyz @ T[:3, :3].T + T[:3, 3], self.rgb, T[:3, :3] @ self.covariance @ T[:3, :3].T)
 
-    def chosen(self, which: F64) -> Points:
-        """Return those that a mask or indices choose."""
+    def chosen(self, which: Bool) -> Points:
+        """Return those that a mask ``(N,)`` chooses."""
         return Points(self.xyz[which], self.rgb[which], self.covariance[which])
 
     def joined(self, other: Points) -> Points:
@@ -117,6 +116,12 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
             file; a camera that stands or only turns.
     """
     pictures = drive.of(drive.front)
+    if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
+        found = f"{len(pictures)} photographs of the camera {drive.front!r}"
+        raise InputError(DOING, str(folder), found, f"give at least {FEWEST} photographs with poses along a drive")
+    if len(pictures) > MOST:
+        found = f"{len(pictures)} photographs of the camera {drive.front!r}, at most {MOST}"
+        raise InputError(DOING, str(folder), found, "give a part of the drive, or every second photograph with its pose")
     for one in drive.pictures:
         if photographs:
             whole_photograph(one.file, one.lens, one.where)
@@ -124,9 +129,6 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
         if (one.lens.width, one.lens.height) != (first.width, first.height):
             found = f"{one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}"
             raise InputError(DOING, f"{one.where}, {one.file}", found, "give the photographs as they were, each with its camera's name")
-    if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
-        found = f"{len(pictures)} photographs of the camera {drive.front!r}"
-        raise InputError(DOING, str(folder), found, f"give at least {FEWEST} photographs with poses along a drive")
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     length = float(steps.sum())

@@ -14,7 +14,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.drives.build import Report, begin, finished, key_of, shown_photographs, write_folder, write_photographs
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, place
+from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
 from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -99,7 +99,7 @@ def _built(
     if not has_photographs:
         views["fitted"] = _blank(drive, placed)
     drive = replace(drive, notes=(*drive.notes, _said(has_photographs), "the sky is black: a model of Gaussians has none"))
-    return write_folder(work, drive, placed, model, shown, views, {}, tell)
+    return write_folder(work, drive, placed, corridor(placed.ego, placed.ground), model, shown, views, {}, tell)
 
 
 def _carried(placed: PlacedDrive) -> float:

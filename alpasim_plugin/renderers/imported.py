@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, F64, Bool, Frame, Photograph, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F32, F64, STANDING_ID, Bool, Frame, Photograph, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.balance import gain_between
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
@@ -26,7 +26,6 @@ from alpasim_plugin.renderers.recorded import recorded_frames
 
 TILE_M = 24.0  # the background is culled in blocks of this size
 OPAQUE = 0.5
-STANDING = "obstacle-"  # ids of what stands in the model itself: it is not drawn once more
 
 
 class ImportedRenderer(Renderer):
@@ -84,7 +83,7 @@ def graph_of(scenario: Scenario) -> SceneGraph:
             if a.actor_id in model.actors
             else build_actor(a, scenario.scene_id, scenario.seed)
             for a in scenario.actors
-            if not a.actor_id.startswith(STANDING)
+            if not a.actor_id.startswith(STANDING_ID)
         ]
         return SceneGraph(background, actors, model.sky)
 

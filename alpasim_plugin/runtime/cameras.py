@@ -12,7 +12,7 @@ from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
 from alpasim_plugin.plugins.interfaces import BlockRule
-from alpasim_plugin.runtime.loop_state import Forecaster, PredictedRequests, shutter_poses
+from alpasim_plugin.runtime.loop_state import Forecaster, PredictedRequests, drawn, shutter_poses
 
 IN_BLOCKS = "setting up a loop in whole blocks of frames"
 
@@ -149,11 +149,12 @@ class CameraRig:
 
         In a cadence of whole blocks the requests of a block are returned together when its last frame is due.
         """
+        shown = drawn(actors)
         forecast = self._forecaster.now() if self._forecaster and self._lookahead else None
         for camera, period in self._due:
             if self._is_due(tick.t_us, period):
                 ahead = PredictedRequests(forecast, camera, self._next_us(tick.t_us, period)) if forecast else ()
-                self._held.append(RenderRequest(tick.t_us, camera, shutter_poses(history, camera, tick.t_us), actors, ahead))
+                self._held.append(RenderRequest(tick.t_us, camera, shutter_poses(history, camera, tick.t_us), shown, ahead))
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
         ready, self._held = self._held, []

@@ -15,7 +15,20 @@ import numpy as np
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.geometry import arc_lengths, interpolate, project, quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
-from alpasim_plugin.core.types import F64, I64, CameraSpec, EgoState, Frame, Latency, Observation, Plan, RenderRequest, Scenario, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    STANDING_ID,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Latency,
+    Observation,
+    Plan,
+    RenderRequest,
+    Scenario,
+    Trajectory,
+)
 from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
@@ -24,6 +37,11 @@ from alpasim_plugin.world.route import route_in_rig
 DIRECTION_M = 1.0
 STANDS_MPS = 1.0
 SPEED_SPAN_US = 500_000
+
+
+def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
+    """Return the poses of the actors that are drawn: what stands in a reconstruction is in its pictures already."""
+    return {name: T for name, T in actors.items() if not name.startswith(STANDING_ID)}
 
 
 @dataclass
@@ -225,7 +243,7 @@ class Forecast:
         self._extend(t_us)
         upto = int(np.searchsorted(self.history.t_us, t_us, side="right"))
         past = Trajectory(self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto])
-        return RenderRequest(t_us, camera, shutter_poses(past, camera, t_us), self.actors.at(t_us))
+        return RenderRequest(t_us, camera, shutter_poses(past, camera, t_us), drawn(self.actors.at(t_us)))
 
     def _extend(self, to_us: int) -> None:
         states = []

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.contact import FRONT, LATERAL, REAR, SweptContacts, find_contacts, find_swept, last_per_step
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
@@ -20,7 +20,6 @@ from evaluators.metrics.score import handover_us, series, with_preset
 
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 NO_CONTACT = "nothing touches the ego"
-STANDING = "obstacle-"  # ids of what stands in a reconstruction and was found there; the id also says how exactly
 NOT_LOOKED_FOR = "standing obstacles were not looked for: no contact with a tracked road user does not mean no contact"
 
 
@@ -109,7 +108,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
 def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
     """Return at which steps something touches the ego that was found standing in a reconstruction."""
     touched = np.zeros(count, dtype=np.bool_)
-    touched[[k for k, one in zip(step, actor, strict=True) if actors.ids[one].startswith(STANDING)]] = True
+    touched[[k for k, one in zip(step, actor, strict=True) if actors.ids[one].startswith(STANDING_ID)]] = True
     return touched
 
 

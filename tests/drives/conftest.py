@@ -12,7 +12,7 @@ from alpasim_plugin.drives import build
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
-from tests.drives.street import write_kitti
+from tests.drives.street import write_kitti, write_transforms
 
 
 def at_once(views: Any, kept: Any, points: Any, *rest: Any) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
@@ -25,6 +25,18 @@ def at_once(views: Any, kept: Any, points: Any, *rest: Any) -> tuple[Reconstruct
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the fit out."""
     monkeypatch.setattr(build, "fitted", at_once)
+
+
+@pytest.fixture(scope="session")
+def kitti_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the street as a KITTI folder, not to be changed."""
+    return write_kitti(tmp_path_factory.mktemp("kitti") / "street")
+
+
+@pytest.fixture(scope="session")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the street as a ``transforms.json`` in metres, not to be changed."""
+    return write_transforms(tmp_path_factory.mktemp("walk") / "walk", unit="m")
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,9 @@ K = np.array([[FOCAL, 0.0, WIDTH / 2 + 3], [0.0, FOCAL, HEIGHT / 2 - 10], [0.0, 
 RIG_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
+_seen: dict[object, np.ndarray] = {}  # photographs that were drawn in this process
+
+
 @dataclass(frozen=True)
 class Street:
     """What the photographs show.
@@ -44,6 +47,12 @@ class Street:
 
     def photograph(self, T: np.ndarray, bend: np.ndarray | None = None, fisheye: bool = False) -> np.ndarray:
         """Return what a camera at a pose sees, ``(H, W, 3)`` uint8 BGR; with a lens that bends lines where coefficients are given."""
+        key = (self.bow_m, np.round(T, 9).tobytes(), None if bend is None else bend.tobytes(), fisheye)
+        if key not in _seen:
+            _seen[key] = self._photograph(T, bend, fisheye)
+        return _seen[key]
+
+    def _photograph(self, T: np.ndarray, bend: np.ndarray | None, fisheye: bool) -> np.ndarray:
         v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
         pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
         middle = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.build import import_drive
-from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_kitti, write_transforms
+from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_transforms
 
 Change = Callable[[Path], None]
 
@@ -133,9 +134,9 @@ def many_pictures_without_poses(folder: Path) -> None:
     ],
 )
 def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
-    tmp_path: Path, change: Change, found: str, do: str, quick_fit: None
+    tmp_path: Path, kitti_street: Path, change: Change, found: str, do: str, quick_fit: None
 ) -> None:
-    folder = write_kitti(tmp_path / "street")
+    folder = Path(shutil.copytree(kitti_street, tmp_path / "street"))
     change(folder)
     before = sorted(path.name for path in tmp_path.iterdir())
     with pytest.raises(InputError) as caught:
@@ -184,3 +185,12 @@ def test_photographs_without_poses_name_the_extra_where_it_is_missing(tmp_path: 
         import_drive(tmp_path / "photos", tmp_path / "out")
     assert "[sfm]" in caught.value.do_this
     assert not (tmp_path / ".out.poses").exists()
+
+
+def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path: Path, walk: Path) -> None:
+    folder = Path(shutil.copytree(walk, tmp_path / "walk"))
+    document = json.loads((folder / "transforms.json").read_text())
+    document["frames"] = [frame for _ in range(30) for frame in document["frames"]]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="720 photographs"):
+        import_drive(folder, tmp_path / "out")

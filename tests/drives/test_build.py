@@ -102,3 +102,51 @@ def test_the_command_tells_what_it_found(tmp_path: Path, quick_fit: None, capsys
     assert any("axes recognised as opengl" in note for note in told["notes"])
     assert told["held-out"]["psnr_db"] > 5
     assert "## What is missing or assumed" in (tmp_path / "out/quality.md").read_text()
+
+
+XODR = """<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/><road name="r" length="60" id="1" junction="-1"><planView>
+<geometry s="0" x="{x}" y="{y}" hdg="0" length="60"><line/></geometry></planView><elevationProfile/><lanes><laneSection s="0">
+<center><lane id="0" type="none" level="false"/></center><right><lane id="-1" type="driving" level="false">
+<width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right></laneSection></lanes></road></OpenDRIVE>"""
+
+
+def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(tmp_path: Path, quick_fit: None) -> None:
+    folder = write_transforms(tmp_path / "walk", unit="m")
+    (tmp_path / "here.xodr").write_text(XODR.format(x=-10, y=1.75))
+    (tmp_path / "away.xodr").write_text(XODR.format(x=-10, y=501.75))
+    with pytest.raises(InputError, match=r"\+500\.. m in y"):
+        import_drive(folder, tmp_path / "out", lane_map=tmp_path / "away.xodr")
+    assert not (tmp_path / "out").exists()
+    assert run_command(["import", "drive", str(folder), "--out", str(tmp_path / "out"), "--map", str(tmp_path / "here.xodr")]) == 0
+    scenario = load_scenario(tmp_path / "out/scenario.yaml")
+    (lane,) = scenario.lane_map.lanes.values()
+    assert np.abs(lane.centre[:, 2] - height_at(scenario.ground, lane.centre)).max() < 1e-9
+    assert np.abs(scenario.ego_log.xyz[:, 1] - np.interp(scenario.ego_log.xyz[:, 0], lane.centre[:, 0], lane.centre[:, 1])).max() < 0.3
+
+
+def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(imported: Path, tmp_path: Path) -> None:
+    from scenarios.usdz import read_usdz
+    from scenarios.usdz_write import write_usdz
+
+    scenario = load_scenario(imported / "scenario.yaml")
+    write_usdz(tmp_path / "street.usdz", scenario)
+    scene = read_usdz(tmp_path / "street.usdz")
+    assert scene.scene_id == scenario.scene_id
+    assert np.allclose(scene.ego_log.xyz, scenario.ego_log.xyz)
+    assert len(scene.lane_map.lanes) == 1
+    assert len(scene.actors) == len(scenario.actors)
+
+
+def test_policies_drive_behind_the_reconstruction_and_clean_is_refused(
+    imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = str(imported / "scenario.yaml")
+    short = ["--set", "timing.duration_us=700000", "--certify", "none", "--workers", "1", "--no-report", "--json"]
+    assert run_command(["--renderer", "3dgs", "--policy", "log-replay", scenario, "--out", str(tmp_path / "run"), *short]) == 0
+    told = json.loads(capsys.readouterr().out)
+    metrics = told["metrics"]["3dgs"] if "metrics" in told else json.loads((tmp_path / "run/summary.json").read_text())["metrics"]["3dgs"]
+    assert metrics["collision_standing"]["mean"] == 0.0
+    assert metrics["collision_any"]["mean"] == 0.0
+    assert metrics["offroad"]["mean"] == 0.0
+    assert run_command(["--renderer", "clean", "--policy", "log-replay", scenario, "--out", str(tmp_path / "no"), *short]) != 0
+    assert "nothing was built" in capsys.readouterr().out + str([path.read_text() for path in (tmp_path / "no").rglob("manifest.json")])

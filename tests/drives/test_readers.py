@@ -125,3 +125,19 @@ def test_times_put_photographs_in_order(tmp_path: Path) -> None:
     drive = read_source(folder, folder / "work", told)
     assert [one.t_us for one in drive.pictures] == [50_000 * i for i in range(COUNT)]
     assert drive.metric == "the file's word that its unit is the metre"
+
+
+def test_a_real_rig_becomes_a_scenario_with_its_tracks(shared_data: Path, tmp_path: Path, quick_fit: None) -> None:
+    from alpasim_plugin.drives.build import import_drive
+    from scenarios.load import load_scenario
+
+    if not (shared_data / "dgp").is_dir():
+        pytest.skip("the rig is not here")
+    import_drive(shared_data / "dgp", tmp_path / "out")
+    scenario = load_scenario(tmp_path / "out/scenario.yaml")
+    tracked = [actor for actor in scenario.actors if not actor.actor_id.startswith("obstacle-")]
+    assert len(tracked) == 9
+    assert min(int(actor.track.t_us[0]) for actor in tracked) == pytest.approx(91_370, abs=10)
+    assert len(scenario.cameras) == 6
+    assert scenario.cameras[0].name == "front"
+    assert (scenario.end_us - scenario.start_us) >= 1_000_000

@@ -91,5 +91,5 @@ def test_default_camera_looks_ahead_and_a_little_down() -> None:
 
 
 def test_every_source_has_help_and_a_reader() -> None:
-    assert list(names("source")) == ["argoverse", "commonroad", "cosmos", "usdz"]
+    assert list(names("source")) == ["argoverse", "commonroad", "cosmos", "drive", "usdz"]
     assert all(names("source").values())

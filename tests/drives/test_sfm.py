@@ -1,0 +1,74 @@
+"""Photographs and videos without poses: structure from motion finds the way of a car that drives straight on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.build import _points
+from alpasim_plugin.drives.opening import read_source
+from alpasim_plugin.drives.placing import place
+from alpasim_plugin.drives.sfm import FRAMES, TIMES
+from alpasim_plugin.drives.source import checked
+from tests.drives.street import COUNT, FOCAL, STEP_M, Street, stations
+
+
+def told(*given: Any) -> None:
+    """Take reports of progress."""
+
+
+def film(path: Path, black: int = 1) -> Path:
+    """Write the street as a video of 10 frames a second that begins with black frames."""
+    import av
+
+    street = Street()
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.bit_rate = 320, 128, 8_000_000
+        pictures = [np.zeros((128, 320, 3), np.uint8)] * black + [street.photograph(street.pose(x)) for x in stations()]
+        for picture in pictures:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+def test_a_video_becomes_a_drive(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
+    path, work = film(tmp_path / "street.mp4"), tmp_path / "work"
+    drive = checked(read_source(path, work, told), path)
+    assert (drive.kind, drive.metric) == ("sfm", None)
+    assert "1 black frames were dropped" in drive.notes
+    times = [one.t_us for one in drive.pictures]
+    assert len(times) > 0.8 * COUNT
+    assert np.diff(times).min() == pytest.approx(100_000, abs=10)
+    placed = place(drive, _points(drive, path, told), camera_height_m=1.5)
+    ego = placed.ego.xyz
+    way = np.linalg.norm(ego[-1] - ego[0]) / ((times[-1] - times[0]) / 1e5)
+    free = drive.pictures[0].lens.K[0, 0] / FOCAL  # driving straight on: a longer lens and a longer way look the same
+    assert way == pytest.approx(STEP_M * free, rel=0.15)
+    before = sorted(one.name for one in (work / FRAMES).iterdir())
+    again = read_source(path, work, told)  # goes on from what was found
+    assert [one.T_world_camera.tolist() for one in again.pictures] == [one.T_world_camera.tolist() for one in drive.pictures]
+    assert sorted(one.name for one in (work / FRAMES).iterdir()) == before
+
+
+def test_a_video_that_shows_nothing_or_is_none_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "odd.mp4"
+    path.write_bytes(b"\0" * 2000)
+    with pytest.raises(InputError, match="video"):
+        read_source(path, tmp_path / "work", told)
+    dark = tmp_path / "dark"
+    dark.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(dark / f"{i}.png"), np.zeros((128, 320, 3), np.uint8))
+    pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
+    with pytest.raises(InputError, match=r"no two photographs|could be registered"):
+        read_source(dark, tmp_path / "work2", told)
+    assert (tmp_path / "work2" / TIMES).is_file()
