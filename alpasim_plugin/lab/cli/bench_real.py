@@ -19,7 +19,8 @@ from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
 from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.plugins.parts import split_names
+from alpasim_plugin.runtime.cell import make_renderer
 from scenarios.load import load_scenario
 
 EPILOG = """
@@ -80,7 +81,7 @@ def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
 
 
 def _names(text: str) -> list[str]:
-    names = [part.strip() for part in text.split(",") if part.strip()]
+    names = split_names(text)
     if not names or len(set(names)) < len(names):
         raise InputError(DOING, f"--renderer {text}", "no renderer, or one twice", "write for example 3dgs,onefixer")
     return names
