@@ -12,7 +12,7 @@ from rich.console import Console
 
 from alpasim_plugin.cli.options import Evaluators, Json, Preset, Quiet, Report, Wait
 from alpasim_plugin.cli.progress import describe, report_line
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import InputError, four_parts
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.run_folder.manifests import read_run_json
 from alpasim_plugin.runtime.score_logs import KnownScenes, find_logs
@@ -98,11 +98,10 @@ def _print(result: ScoreResult, as_json: bool) -> None:
         return
     Console().print(render_table(result.summary, headline_only=True, known=MetricTable.of_run(read_run_json(result.root))))
     for cell in result.summary["failures"]["cells"][:5]:
-        print(f"failed: {cell['error']['with']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
+        print(four_parts(cell["error"]), file=sys.stderr)
     aggregation = result.summary.get("alpasim") or {}
     if aggregation.get("skipped"):
         print(f"AlpaSim's aggregation was not written: {aggregation['skipped']}", file=sys.stderr)
     if aggregation.get("error"):
-        error = aggregation["error"]
-        print(f"error: {error['doing']}\n   with: {error['with']}\n  found: {error['found']}\n     do: {error['do']}", file=sys.stderr)
+        print(four_parts(aggregation["error"]), file=sys.stderr)
     print(report_line(result.root))

@@ -7,6 +7,7 @@ Every failure that a user can meet is a `SimrunError`. Its class sets the proces
 from __future__ import annotations
 
 import traceback
+from collections.abc import Mapping
 from typing import ClassVar
 
 from alpasim_plugin.core.escape import shorten, terminal
@@ -33,7 +34,7 @@ class SimrunError(Exception):
         self.doing, self.with_what, self.found, self.do_this = doing, with_what, found, do_this
 
     def __str__(self) -> str:
-        return f"error: {self.doing}\n   with: {self.with_what}\n  found: {self.found}\n     do: {self.do_this}"
+        return four_parts(self.as_dict())
 
     def as_dict(self) -> dict[str, str]:
         """Return the four parts and the failure class, for ``--json`` and manifests."""
@@ -44,6 +45,11 @@ class SimrunError(Exception):
             "do": self.do_this,
             "failure_class": self.failure_class,
         }
+
+
+def four_parts(error: Mapping[str, str]) -> str:
+    """Return the text of an error from what `SimrunError.as_dict` gave."""
+    return f"error: {error['doing']}\n   with: {error['with']}\n  found: {error['found']}\n     do: {error['do']}"
 
 
 class InputError(SimrunError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -23,7 +23,7 @@ class _Part(BaseModel):
 class MinAde(_Part):
     """Scorer of plan samples."""
 
-    time_deltas: tuple[float, ...] = Field(default=(0.5, 1.0, 2.5, 5.0), min_length=1)
+    time_deltas: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(0.5, 1.0, 2.5, 5.0), min_length=1)
     incl_z: bool = False
     target: Literal["GT", "SELF"] = "GT"
 

@@ -133,7 +133,10 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
     found = {row["rollout"]: (row["status"], row["failure_class"]) for row in rows(out)}
     name = first.parent.name  # the session id, of which the second log is another copy
     assert found == {f"{name} (whole)": ("ok", None), name: ("failed", "infrastructure"), "beheaded": ("failed", "input")}
-    assert "of 80 control steps" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "of 80 control steps" in said
+    parts = [line.split(":")[0].strip() for line in said.splitlines()[-8:]]
+    assert parts == ["error", "with", "found", "do"] * 2, "four parts for each damaged log"
 
 
 def test_lanes_without_rails_are_centres_widened(golden, tmp_path):

@@ -187,6 +187,10 @@ def test_settings_name_the_nearest_key_and_refuse_senseless_values(tmp_path):
     path.write_text("scene_score: {progress_saturation_threshold: 0}\n")
     with pytest.raises(InputError, match="progress_saturation_threshold"):
         load_settings(path)
+    for senseless in ("-1", "0.0", ".nan"):
+        path.write_text(f"scorers: {{min_ade: {{time_deltas: [0.5, {senseless}]}}}}\n")
+        with pytest.raises(InputError, match="time_deltas"):
+            load_settings(path)
     path.write_text("video: {render_video: true}\nscorers: {min_ade: {target: SELF, time_deltas: [0.4]}}\n")
     chosen = load_settings(path).preset()
     assert (chosen.min_ade_target, chosen.min_ade_horizons_s, chosen.stop_beyond_gt_m) == ("self", (0.4,), 4.0)
