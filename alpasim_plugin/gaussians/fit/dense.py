@@ -26,6 +26,7 @@ RESIDUAL_PX = 0.7  # between flow and what the depth predicts
 LEAST_SUPPORT = 3  # neighbours that agree; two at the ends of the way
 NOISE_PX, LARGEST_SPREAD = 0.25, 0.10  # of flow; of a depth, as a share of it
 NEAR_M, FAR_M = 0.5, 300.0
+LEAST_STEP = 1.2  # levels of brightness from pixel to pixel, within two pixels
 ROUNDS = 3
 FEWEST_POINTS = 12  # that tracks must place in a view
 AGREE = 0.06  # share by which the depths of two views may differ
@@ -135,12 +136,20 @@ def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> DepthMap:
         information += good * (J * J).sum(axis=2)
     sigma = NOISE_PX / np.sqrt(np.maximum(information, 1e-12))  # of the inverse depth
     known = (support >= min(LEAST_SUPPORT, len(seen) - 1)) & (q > 1 / FAR_M) & (sigma < LARGEST_SPREAD * q)
+    known &= _textured(view)[::STRIDE, ::STRIDE]
     if view.mask is not None:
         known &= view.mask[::STRIDE, ::STRIDE]
     depth, spread = np.zeros(view.rgb.shape[:2], np.float32), np.zeros(view.rgb.shape[:2], np.float32)
     depth[::STRIDE, ::STRIDE] = np.where(known, 1 / np.maximum(q, 1e-6), 0)
     spread[::STRIDE, ::STRIDE] = np.where(known, sigma / np.maximum(q, 1e-6), 0)
     return DepthMap(depth, spread)
+
+
+def _textured(view: PosedView) -> Bool:
+    """Return where there is something to follow ``(H, W)``: flow carries the motion of an edge far into a smooth sky or wall beside it."""
+    grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
+    step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
+    return np.asarray(cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)
 
 
 def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> DepthMap:

@@ -132,9 +132,11 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
     way = np.linalg.norm(np.diff([view.camera.centre_world for view in views], axis=0), axis=1).sum() if len(views) > 1 else 0.0
     masks = sky_masks(measured) if way > LEAST_WAY_M else [None] * len(views)
     gains = balances(views, tracks)
+    skies = [mask if view.sky is None else view.sky for view, mask in zip(measured, masks, strict=True)]
+    free = [view.depth if sky is None else np.where(sky, 0, view.depth) for view, sky in zip(measured, skies, strict=True)]
     done = [
-        replace(view, sky=mask if view.sky is None else view.sky, gain=(float(r), float(g), float(b)))
-        for view, mask, (r, g, b) in zip(measured, masks, gains, strict=True)
+        replace(view, sky=sky, depth=depth, gain=(float(r), float(g), float(b)))
+        for view, sky, depth, (r, g, b) in zip(measured, skies, free, gains, strict=True)
     ]
     guesses = [between_points(view.camera, tracks, placed, i) for i, view in enumerate(views)]
     return done, [None if q is None else 1 / np.maximum(q, np.float32(1e-3)) for q in guesses]

@@ -1,9 +1,9 @@
 """Lane paint in pictures: which pixels are painted, and how much of it was invented or lost.
 
-A pixel is paint where the road is seen and it is brighter than the road on both its sides along the row, which must be alike: the symmetrical
-local threshold, best of the comparison by Veit et al. (ITSC 2008). Brightness is the mean of red and green, so that white and yellow count
-alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The detector is simple on purpose and the same for
-the photograph and for what is measured: a kerb's bright edge is paint in both.
+A pixel is paint where the road is seen and it is brighter than the road on both its sides along the row, which must be alike: the
+symmetrical local threshold, best of the comparison by Veit et al. (ITSC 2008). Brightness is the mean of red and green, so that white and
+yellow count alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The detector is simple on purpose
+and the same for the photograph and for what is measured: a kerb's bright edge is paint in both.
 
 Precision is the share of the painted pixels of a picture that lie within `TOLERANCE_PX` of a painted pixel of the photograph; recall is the
 share of the photograph's that lie so near to one of the picture. Paint that is nowhere in the photograph is invented: 1 - precision.

@@ -1,0 +1,138 @@
+"""`fit_drive` on a drawn street: learns depth with the colours, tells about views held out, resumes, refuses what it cannot start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.gaussians.fit import SplatRecipe
+from alpasim_plugin.gaussians.fit.drive import FittedDrive, fit_drive
+from alpasim_plugin.gaussians.fit.loop import SplatFit
+from alpasim_plugin.gaussians.fit.model import Exposure, needles
+from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
+from alpasim_plugin.gaussians.fit.views import PosedView
+from tests.gaussians.fit.street_views import brightened, street_views, true_depth
+
+QUICK = replace(SplatRecipe.street(), steps=45, points=3000, cap=3500, save_every=15, densify_every=20)
+GAINS = [(1 + 0.1 * np.sin(i),) * 3 for i in range(8)]
+
+
+@pytest.fixture(scope="module")
+def views() -> list[PosedView]:
+    return [brightened(view, gain) for view, gain in zip(street_views(8), GAINS, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def fitted(views: list[PosedView]) -> tuple[FittedDrive, list[tuple[str, dict[str, float]]]]:
+    told: list[tuple[str, dict[str, float]]] = []
+    done = fit_drive(
+        [*views[:4], *views[5:]], None, kept=views[4:5], scene_id="s", threads=1, recipe=QUICK,
+        report=lambda stage, at, all, numbers: told.append((stage, dict(numbers))),
+    )  # fmt: skip
+    return done, told
+
+
+def test_a_view_that_was_kept_is_shown_and_reported_on_the_way(fitted: tuple[FittedDrive, list[tuple[str, dict[str, float]]]]) -> None:
+    heard = [numbers["held_out_db"] for _, numbers in fitted[1] if "held_out_db" in numbers]
+    assert len(heard) == 3
+    assert heard[-1] > 18.0
+    assert heard[-1] > heard[0]
+
+
+def test_the_depth_of_the_fit_is_the_street_s(fitted: tuple[FittedDrive, object], views: list[PosedView]) -> None:
+    out = fitted[0].model.graph().render(views[4].camera, {}, 1)
+    truth = true_depth(views[4])
+    near = np.isfinite(truth) & (truth < 20) & (out.alpha > 0.5)
+    assert near.mean() > 0.4
+    assert np.median(np.abs(out.depth[near] / truth[near] - 1)) < 0.05
+
+
+def test_the_sky_stays_free_of_gaussians(fitted: tuple[FittedDrive, object], views: list[PosedView]) -> None:
+    sky = ~np.isfinite(true_depth(views[4]))
+    out = fitted[0].model.graph().render(views[4].camera, {}, 1)
+    assert out.alpha[sky].mean() < 0.25
+
+
+def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(fitted: tuple[FittedDrive, object]) -> None:
+    found = fitted[0].exposures
+    assert len(found) == 8
+    fitted_ones = [i for i in range(8) if i != 4]
+    ratio = np.array([found[f"front-{i:06d}"][1] / GAINS[i][1] for i in fitted_ones])
+    assert np.abs(ratio / ratio.mean() - 1).max() < 0.04
+    between = (found["front-000003"][1] + found["front-000005"][1]) / 2
+    assert found["front-000004"][1] == pytest.approx(between, abs=0.01)
+
+
+def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(views: list[PosedView], tmp_path) -> None:
+    recipe = replace(QUICK, steps=8, save_every=4, points=500, cap=600)
+
+    class CutOffError(Exception):
+        pass
+
+    def cut(stage: str, at: int, all: int, numbers: object) -> None:
+        if stage == "fitting" and at == 6:
+            raise CutOffError
+
+    whole = fit_drive(views, None, recipe=recipe, threads=1)
+    with pytest.raises(CutOffError):
+        fit_drive(views, None, recipe=recipe, threads=1, folder=tmp_path, report=cut)
+    again = fit_drive(views, None, recipe=recipe, threads=1, folder=tmp_path)
+    assert again.exposures == whole.exposures
+    assert again.model.background.means.tobytes() == whole.model.background.means.tobytes()
+
+
+def test_photographs_that_share_nothing_and_no_points_are_refused(views: list[PosedView]) -> None:
+    rng = np.random.default_rng(0)
+    noise = [replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8)) for view in views[:3]]
+    with pytest.raises(InputError, match="nothing whose distance they measure"):
+        fit_drive(noise, None, recipe=QUICK)
+    with pytest.raises(InputError, match="no photograph"):
+        fit_drive([], None)
+
+
+def test_photographs_that_share_nothing_start_from_given_points(views: list[PosedView]) -> None:
+    rng = np.random.default_rng(0)
+    noise = [replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8)) for view in views[:2]]
+    points = cloud_from_points(rng.uniform([4, -3, 0], [12, 3, 2], (50, 3)), np.full((50, 3), 0.5))
+    assert len(fit_drive(noise, points, recipe=replace(QUICK, steps=2, densify_every=0)).model) == 50
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5])
+def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[PosedView], weight: float) -> None:
+    """Of a flat grey picture colours say nothing: only the weight pulls the points, 12 m away, to the depth of 8 m."""
+    rng = np.random.default_rng(0)
+    flat = replace(views[0], rgb=np.full_like(views[0].rgb, 128), depth=np.full(views[0].rgb.shape[:2], 8.0, np.float32))
+    points = np.column_stack([np.full(400, 12.0), rng.uniform(-4, 4, 400), rng.uniform(0, 4, 400)])
+    cloud = cloud_from_points(points, np.full((400, 3), 0.5))
+    recipe = SplatRecipe(steps=60, densify_every=0, depth_weight=weight, lr_means=0.05, lr_means_end=0.05)
+    run = SplatFit([flat], Start(cloud, {}), recipe, "s", "cpu", 1, None)
+    while run.step < recipe.steps:
+        run.update()
+    x = float(np.median(run.model.clouds()[0].means[:, 0]))
+    assert (abs(x - 12.0) < 0.5) if weight == 0 else (x < 10.5)
+
+
+def test_a_needle_costs_and_a_disc_does_not() -> None:
+    disc, needle = torch.log(torch.tensor([[1.0, 1.0, 0.01]])), torch.log(torch.tensor([[1.0, 0.05, 0.05]]))
+    assert float(needles(disc, 6.0)) == 0
+    assert float(needles(needle, 6.0)) == pytest.approx(np.log(20 / 6), rel=1e-4)
+
+
+def test_an_exposure_learns_its_gain_and_keeps_the_mean() -> None:
+    exposure = Exposure(np.ones((2, 3)))
+    for _ in range(200):
+        ((exposure.gain(0) - 1.2) ** 2).sum().backward()
+        exposure.update(0.01)
+    gains = exposure.gains()
+    assert gains[0, 0] == pytest.approx(1.2, abs=0.03)
+    assert np.allclose(np.log(gains).sum(axis=0), 0, atol=1e-4)
+    again = Exposure(np.ones((2, 3)))
+    again.restore(exposure.state())
+    for one in (exposure, again):
+        ((one.gain(1) - 1.1) ** 2).sum().backward()
+        one.update(0.01)
+    assert np.array_equal(exposure.gains(), again.gains())

@@ -1,0 +1,153 @@
+"""What photographs say before a fit, on a street whose truth is known: tracks, poses, depth, sky, exposure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.gaussians.fit.adjust import adjust, corrected
+from alpasim_plugin.gaussians.fit.balance import balances, gain_between
+from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps
+from alpasim_plugin.gaussians.fit.segment_sky import sky_masks
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, follow, place
+from alpasim_plugin.gaussians.fit.views import PosedView, halved
+from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
+
+
+@pytest.fixture(scope="module")
+def views() -> list[PosedView]:
+    return street_views()
+
+
+@pytest.fixture(scope="module")
+def tracks(views: list[PosedView]) -> Tracks:
+    return follow(views)
+
+
+@pytest.fixture(scope="module")
+def placed(views: list[PosedView], tracks: Tracks) -> Placed:
+    return place(tracks, [view.camera for view in views])
+
+
+def test_points_followed_through_the_street_lie_on_its_surfaces(tracks: Tracks, placed: Placed) -> None:
+    good = np.ones(tracks.count, bool)
+    np.logical_and.at(good, tracks.point, placed.error_px < 0.5)
+    good &= placed.angle_rad > 0.05
+    xyz = placed.xyz[good]
+    slack = 0.03 * np.linalg.norm(xyz, axis=1)  # a small angle leaves the distance uncertain
+    on_wall, on_road = np.abs(np.abs(xyz[:, 1]) - 5.0) < slack, np.abs(xyz[:, 2]) < slack
+    on_box = (np.abs(xyz[:, 1] - 2.9) < 1.0 + slack) & (np.abs(xyz[:, 0] - 16.0) < 2.2 + slack)
+    assert good.sum() > 200
+    assert (on_wall | on_road | on_box).mean() > 0.95
+
+
+def test_a_point_seen_once_is_no_track(tracks: Tracks) -> None:
+    first = tracks.only(tracks.view == 0)
+    assert first.count == 0
+    two = tracks.only(tracks.view < 2)
+    assert (np.bincount(two.point) == 2).all()
+
+
+def test_masked_pixels_start_no_track(views: list[PosedView]) -> None:
+    mask = np.ones(views[0].rgb.shape[:2], bool)
+    mask[64:] = False
+    found = follow([replace(view, mask=mask) for view in views[:3]])
+    assert found.count > 20
+    assert found.at[found.view == 0][:, 1].max() < 65
+
+
+def test_poses_that_are_off_come_back_to_the_truth(views: list[PosedView]) -> None:
+    rng = np.random.default_rng(3)
+    wrong = [turned(view, rng.normal(0, 0.003, 3), rng.normal(0, 0.02, 3)) for view in views]
+    found = corrected(wrong)
+    assert found.before_px > 3 * found.after_px
+    assert found.after_px < 0.3
+
+    def errors(cameras: list) -> np.ndarray:
+        """Return turns between neighbours against the truth, degrees: what all have in common does not count."""
+        out = []
+        for a, b, c, d in zip(cameras, cameras[1:], views, views[1:], strict=False):
+            mine, true = (
+                b.T_camera_world @ np.linalg.inv(a.T_camera_world),
+                d.camera.T_camera_world @ np.linalg.inv(c.camera.T_camera_world),
+            )
+            out.append(np.degrees(np.arccos(np.clip((np.trace(mine[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))))
+        return np.array(out)
+
+    assert np.median(errors(list(found.cameras))) < 0.25 * np.median(errors([view.camera for view in wrong]))
+
+
+def test_poses_without_tracks_stay_as_they_are(views: list[PosedView]) -> None:
+    cameras = [view.camera for view in views]
+    none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
+    found = adjust(cameras, none)
+    assert list(found.cameras) == cameras
+    assert np.isnan(found.after_px)
+
+
+def test_depth_by_flow_is_the_street_s(views: list[PosedView], tracks: Tracks, placed: Placed) -> None:
+    maps = depth_maps(views, tracks, placed)
+    middle = 4
+    depth, truth = maps[middle].depth, true_depth(views[middle])
+    known = (depth > 0) & np.isfinite(truth)
+    error = np.abs(depth[known] / truth[known] - 1)
+    assert STRIDE**2 * known.mean() > 0.3
+    assert np.median(error) < 0.02
+    assert np.mean(error > 0.15) < 0.08  # the box hides some of the wall
+    assert (maps[middle].spread[depth > 0] > 0).all()
+    assert not (depth > 0)[~np.isfinite(truth)].mean() > 0.02, "the sky has no depth"
+
+
+def test_nothing_is_measured_where_tracks_place_too_few_points(views: list[PosedView]) -> None:
+    none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
+    empty = place(none, [view.camera for view in views])
+    assert between_points(views[0].camera, none, empty, 0) is None
+    assert not any(one.depth.any() for one in depth_maps(views[:3], none, empty))
+
+
+def test_sky_is_found_where_the_street_has_none_of_its_own(views: list[PosedView]) -> None:
+    for view, mask in zip(views, sky_masks(views), strict=True):
+        truth = ~np.isfinite(true_depth(view))
+        assert mask[truth].mean() > 0.7
+        assert not mask[~truth].mean() > 0.005
+
+
+def test_a_smooth_wall_with_depth_is_no_sky(views: list[PosedView]) -> None:
+    walled = [replace(view, depth=np.where(np.isfinite(true_depth(view)), 0, 8).astype(np.float32)) for view in views]
+    thinned = []
+    for view in walled:
+        depth = np.zeros_like(view.depth)
+        depth[::STRIDE, ::STRIDE] = view.depth[::STRIDE, ::STRIDE]
+        thinned.append(replace(view, depth=depth))
+    assert not any(mask.any() for mask in sky_masks(thinned))
+
+
+def test_exposure_and_white_balance_are_found_to_a_percent(views: list[PosedView], tracks: Tracks) -> None:
+    rng = np.random.default_rng(5)
+    true = rng.uniform(0.85, 1.15, (len(views), 3))
+    true /= np.exp(np.log(true).mean(axis=0))
+    found = balances([brightened(view, tuple(gain)) for view, gain in zip(views, true, strict=True)], tracks)
+    assert np.abs(found / true - 1).max() < 0.03
+    assert np.abs(np.log(found).mean(axis=0)).max() < 1e-9
+
+
+def test_a_gain_between_photographs_is_that_of_the_nearest_two() -> None:
+    centres, gains = np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]), np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3])
+    assert np.allclose(gain_between(centres, gains, np.array([0.5, 0, 0])), 1.1, atol=1e-3)
+    assert np.allclose(gain_between(centres, gains, np.zeros(3)), 1.0, atol=1e-3)
+    assert np.allclose(gain_between(centres[:0], gains[:0], np.zeros(3)), 1.0)
+
+
+def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views: list[PosedView]) -> None:
+    depth = np.arange(views[0].rgb[..., 0].size, dtype=np.float32).reshape(views[0].rgb.shape[:2])
+    small = halved(replace(views[0], depth=depth, sky=depth > 100, gain=(1.1, 1.0, 0.9)))
+    point = views[0].camera.centre_world + np.array([8.0, 1.0, 0.5])
+    whole, half = (c.K @ (c.T_camera_world[:3, :3] @ point + c.T_camera_world[:3, 3]) for c in (views[0].camera, small.camera))
+    assert np.allclose(whole[:2] / whole[2], 2 * half[:2] / half[2])
+    assert small.depth is not None
+    assert small.depth[1, 1] == depth[2, 2]
+    assert small.sky is not None
+    assert [bool(flag) for flag in small.sky[:2, 50]] == [False, True]
+    assert small.gain == (1.1, 1.0, 0.9)

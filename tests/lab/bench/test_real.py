@@ -1,0 +1,130 @@
+"""`simrun bench real` on a drive made by hand: rows by camera, set and distance, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.lab.bench import colour_video_vdp
+from alpasim_plugin.lab.bench.real import METRICS, Judges, intervals, measure_drive, shots_of
+from alpasim_plugin.lab.cli import bench_real
+from alpasim_plugin.plugins.interfaces import BlockRule, Renderer
+from alpasim_plugin.renderers import make_renderer
+from tests.gaussians.scene_maps import straight
+from tests.renderers.recorded_drive import EXPOSURE, SKY_LEVEL, recorded_drive
+
+KEYS = ["drive", "renderer", "camera", "set", "distance_m", "n_frames", *METRICS]
+
+
+class Difference:
+    """Mean absolute difference, in place of a network."""
+
+    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+        return (a - b).abs().mean(dim=(1, 2, 3))
+
+
+class Truth(Renderer):
+    """Show what the photographs of the drive show, and note the order of requests."""
+
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+
+    def render(self, request: RenderRequest) -> Frame:
+        self.asked.append(request.t_us)
+        picture = np.full((request.camera.height, request.camera.width, 3), 122, np.uint8)
+        picture[: request.camera.height // 2] = round(SKY_LEVEL * EXPOSURE)
+        return Frame(request.t_us, request.camera.name, picture)
+
+
+class Blocks(Truth):
+    block = BlockRule(5, 8)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+    return recorded_drive(tmp_path_factory.mktemp("drive"))
+
+
+def test_photographs_that_no_fit_saw_make_rows_by_camera_and_distance(drive: Scenario) -> None:
+    truth = Truth()
+    rows = measure_drive("d", drive, {"truth": lambda: truth}, Judges(Difference(), None))
+    assert [list(row) for row in rows] == [KEYS] * 2
+    held, beside = rows
+    assert (held["camera"], held["set"], held["n_frames"], held["distance_m"]) == ("front", "held-out", 1, 0.0)
+    assert (beside["camera"], beside["set"], beside["n_frames"]) == ("right", "never-fitted", 9)
+    assert beside["distance_m"] == pytest.approx(0.5, abs=0.02)
+    assert held["psnr_db"] == 100.0
+    assert held["perceptual_syn"] == 0.0
+    assert held["cvvdp_jod"] is None
+    assert held["paint_precision"] is None, "there is no paint"
+    assert truth.asked == sorted(truth.asked[:9]) * 2, "every photograph in order of time, so that a fixer has its history"
+
+
+def test_the_model_is_near_its_photographs_and_a_second_drive_gives_intervals(drive: Scenario) -> None:
+    judges = Judges(Difference(), None)
+    rows = measure_drive("d", drive, {"3dgs": lambda: make_renderer("3dgs", drive, threads=1)}, judges)
+    assert all(float(row["psnr_db"]) > 17 for row in rows)  # type: ignore[arg-type]
+    assert intervals(rows) == []
+    other = [{**row, "drive": "e", "psnr_db": float(row["psnr_db"]) + 2.0} for row in rows]  # type: ignore[arg-type]
+    found = next(row for row in intervals([*rows, *other]) if row["metric"] == "psnr_db" and row["set"] == "held-out")
+    assert found["drives"] == 2
+    assert found["mean"] == pytest.approx(float(rows[0]["psnr_db"]) + 1.0)  # type: ignore[arg-type]
+    low, high = found["ci95"]  # type: ignore[misc]
+    assert (high - low) / 2 == pytest.approx(12.706, rel=1e-3), "Student's t of one degree of freedom, spread of the mean 1"
+
+
+def test_what_cannot_be_measured_is_refused(drive: Scenario) -> None:
+    with pytest.raises(InputError, match="no recorded drive"):
+        shots_of(straight())
+    with pytest.raises(InputError, match="no photograph that the fit did not see"):
+        shots_of(replace(drive, recording=tuple(one for one in drive.recording if one.use == "fitted")))
+    with pytest.raises(InputError, match="blocks of frames"):
+        measure_drive("d", drive, {"blocks": Blocks}, Judges(Difference(), None))
+
+
+def test_the_command_prints_one_document(drive: Scenario, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": drive})
+    monkeypatch.setattr(bench_real, "load_metric", lambda: (None, "cvvdp_jod is not measured: there is no module 'pycvvdp'"))
+    monkeypatch.setattr(bench_real, "load_distance", lambda name: Difference())
+    assert run_command(["bench", "real", "d", "--renderer", "3dgs", "--json", "--threads", "1", "--seed", "1", "--device", "cpu"]) == 0
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    assert list(document) == ["rows"]
+    assert [list(row) for row in document["rows"]] == [KEYS] * 2
+    assert "one drive: no interval" in err
+    assert "cvvdp_jod is not measured" in err
+    assert run_command(["bench", "real", "d", "--renderer", "3dgs,3dgs"]) == 2
+
+
+def test_a_drive_twice_and_a_missing_one_are_refused(tmp_path: Path) -> None:
+    assert run_command(["bench", "real", str(tmp_path / "nowhere")]) == 2
+
+
+def test_without_the_package_the_reason_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(name: str) -> object:
+        raise ModuleNotFoundError("no", name=name)
+
+    monkeypatch.setattr(colour_video_vdp.importlib, "import_module", gone)
+    metric, why = colour_video_vdp.load_metric()
+    assert metric is None
+    assert "pip install cvvdp" in why
+
+
+def test_equal_pictures_are_ten_and_a_damaged_one_is_less() -> None:
+    metric, why = colour_video_vdp.load_metric()
+    if metric is None:
+        pytest.skip(why)
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    truth = rng.integers(60, 200, (1, 64, 96, 3), dtype=np.uint8)
+    assert metric.jod(truth, truth)[0] == pytest.approx(10.0, abs=1e-3)
+    assert metric.jod(np.roll(truth, 3, axis=2), truth)[0] < 9.5

@@ -1,0 +1,102 @@
+"""The renderer 3dgs of an imported drive: its own model, sky as an opaque layer without depth, the recording's exposure and frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.renderers.imported import Exposures, ImportedRenderer
+from alpasim_plugin.renderers.recorded import posed_photograph
+from tests.renderers.recorded_drive import EXPOSURE, HIGH, SKY_LEVEL, WIDE, recorded_drive
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+    return recorded_drive(tmp_path_factory.mktemp("drive"))
+
+
+@pytest.fixture(scope="module")
+def frame(drive: Scenario) -> Frame:
+    camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
+    T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
+    return make_renderer("3dgs", drive, threads=1).render(RenderRequest(t_us, camera, np.stack([T, T]), log_actors(drive, t_us)))
+
+
+def test_3dgs_of_an_imported_drive_is_its_model(drive: Scenario, frame: Frame) -> None:
+    assert isinstance(make_renderer("3dgs", drive), ImportedRenderer)
+    road = frame.rgb[-8:, 20:44].astype(float)
+    assert abs(road.mean() - 0.4 * 255 * EXPOSURE) < 6, "in the exposure of the recording"
+
+
+def test_the_sky_is_opaque_and_has_no_depth(frame: Frame) -> None:
+    assert frame.alpha is not None
+    assert frame.depth is not None
+    up = slice(0, HIGH // 2 - 4)
+    assert np.all(frame.alpha[up] == 1)
+    assert np.all(frame.depth[up] == 0)
+    assert abs(float(frame.rgb[up].mean()) - SKY_LEVEL * EXPOSURE) < 3
+    assert frame.depth[-1, WIDE // 2] > 1
+
+
+def test_a_hole_below_the_horizon_stays_a_hole(drive: Scenario) -> None:
+    camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0])
+    T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
+    T[:3, 3] += [0.0, 200.0, 0.0]  # far beside the road, where there is nothing
+    shown = make_renderer("3dgs", drive, threads=1).render(RenderRequest(t_us, camera, np.stack([T, T]), {}))
+    assert shown.alpha is not None
+    assert shown.alpha[-1].max() < 0.5
+    assert shown.alpha[0].min() == 1
+
+
+def test_what_stands_in_the_model_is_not_drawn_once_more(drive: Scenario) -> None:
+    renderer = make_renderer("3dgs", drive)
+    assert isinstance(renderer, ImportedRenderer)
+    assert "obstacle-001" in log_actors(drive, int(drive.ego_log.t_us[0]))
+    assert not renderer.graph.actors
+
+
+def test_clean_is_refused_because_nothing_was_built(drive: Scenario) -> None:
+    with pytest.raises(InputError, match="nothing was built, so there is no built truth"):
+        make_renderer("clean", drive)
+
+
+def test_a_missing_model_names_the_folder(drive: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere"):
+        make_renderer("3dgs", replace(drive, model=str(tmp_path / "nowhere")))
+
+
+def test_recorded_frames_are_those_of_the_fit_alone(drive: Scenario) -> None:
+    frames = make_renderer("3dgs", drive, threads=1).recorded()
+    assert [one.camera for one in frames] == ["front"] * 8
+    held = next(one for one in drive.recording if one.use == "held-out")
+    assert held.t_us not in {one.t_us for one in frames}
+    first = frames[0]
+    assert first.rgb.shape == (HIGH, WIDE, 3), "at the size at which the camera is rendered"
+    assert first.depth.shape == (HIGH, WIDE)
+    assert np.allclose(first.K, drive.cameras[0].K)
+    assert first.depth[0].max() == 0, "the sky has none"
+    assert first.depth[-1].min() > 1
+    assert np.allclose(first.T_world_camera, drive.recording[0].T_world_camera)
+
+
+def test_a_missing_photograph_is_named(drive: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"gone\.png"):
+        posed_photograph(replace(drive.recording[0], path=str(tmp_path / "gone.png")), WIDE)
+
+
+def test_exposure_follows_the_place_and_the_camera(drive: Scenario) -> None:
+    one, other = drive.recording[0], drive.recording[8]
+    recording = (replace(one, exposure=(1.0, 1.0, 1.0)), replace(other, exposure=(2.0, 1.0, 0.5)))
+    exposures = Exposures.of(recording)
+    assert np.allclose(exposures.near("front", one.T_world_camera[:3, 3]), 1.0, atol=1e-2)
+    assert np.allclose(exposures.near("front", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2)
+    assert np.allclose(exposures.near("roof", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2)
+    assert np.allclose(Exposures.of(()).near("front", np.zeros(3)), 1.0)
