@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 
 from alpasim_plugin.core.types import F64, I64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -112,17 +113,13 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
     ray = np.einsum("nji,nj->ni", R[tracks.view], local)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None]
-    A, b = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
-    np.add.at(A, tracks.point, across)
-    np.add.at(b, tracks.point, np.einsum("nij,nj->ni", across, centre[tracks.view]))
+    A, b = (summed(values, tracks.point, tracks.count) for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view])))
     xyz = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
     for _ in range(ROUNDS):
         e, J, _ = residuals(xyz, tracks, R, t, K)
         w = huber(e)
         JT = J.transpose(0, 2, 1) * w[:, None, None]
-        H, g = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
-        np.add.at(H, tracks.point, JT @ J)
-        np.add.at(g, tracks.point, (JT @ e[..., None])[..., 0])
+        H, g = (summed(values, tracks.point, tracks.count) for values in (JT @ J, (JT @ e[..., None])[..., 0]))
         step = np.linalg.solve(H + 1e-9 * np.eye(3) * (1 + np.trace(H, axis1=1, axis2=2)[:, None, None]), g[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         away = np.linalg.norm(xyz - centre.mean(axis=0), axis=1, keepdims=True)
@@ -155,6 +152,13 @@ def projection_slope(local: F64, z: F64, f: F64) -> F64:
     J[:, 0, 0], J[:, 1, 1] = f[:, 0] / z, f[:, 1] / z
     J[:, :, 2] = -f * local[:, :2] / (z**2)[:, None]
     return J
+
+
+def summed(values: F64, index: I64, count: int) -> F64:
+    """Return the sums ``(count, ...)`` of the ``values (M, ...)`` of each index ``(M,)``."""
+    gather = scipy.sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+    return np.asarray(gather @ flat, np.float64).reshape(count, *values.shape[1:])
 
 
 def huber(e: F64) -> F64:
