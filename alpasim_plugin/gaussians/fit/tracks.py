@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.types import F64, I64, U8, Bool
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
 
@@ -69,9 +69,7 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     return all_.only(np.ones(len(order), dtype=bool))
 
 
-def _corners(
-    grey: U8, taken: np.ndarray[tuple[int, ...], np.dtype[np.float32]], mask: Bool | None
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def _corners(grey: U8, taken: F32, mask: Bool | None) -> F32:
     free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
     for x, y in np.rint(taken).astype(int):
         cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
@@ -79,9 +77,7 @@ def _corners(
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
 
-def _followed(
-    a: U8, b: U8, points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float32]], Bool]:
+def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
     there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points[:, None], None, winSize=WINDOW, maxLevel=4)  # type: ignore[call-overload]
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=WINDOW, maxLevel=4)
     off = np.linalg.norm(back[:, 0] - points, axis=1)

@@ -14,7 +14,7 @@ from rich.console import Console
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
-from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, shots_of
+from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, unseen_cameras
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
@@ -48,7 +48,7 @@ def real(
     del debug
     scenarios = _loaded(drives)
     for scenario in scenarios.values():
-        shots_of(scenario)  # what cannot be measured is refused before anything is rendered
+        unseen_cameras(scenario)  # what cannot be measured is refused before anything is rendered
     vdp, why_not = load_metric()
     judges, console = Judges(load_distance(NAME), vdp), Console(stderr=True)
     if why_not:
