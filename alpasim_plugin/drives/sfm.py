@@ -28,6 +28,7 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 MOST, WIDTH_PX = 80, 1600  # photographs that are registered; their greatest width
 FOCAL_WIDTHS = 0.8  # focal length that is begun with, in widths: 64 degrees across, as cameras behind windscreens have
+FEATURES, OVERLAP = 4000, 5  # of a photograph; the next ones that it is matched with, and then the 8th, 16th, ...
 BLACK = 8.0  # mean grey of a frame that shows nothing
 LEAST_SHARE = 0.5  # of the photographs that must be registered
 PERIOD_US = 100_000
@@ -130,11 +131,12 @@ def _register(path: Path, work: Path, tell: Report) -> None:
     tell("finding features", 0, 1)
     reading = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", default_focal_length_factor=FOCAL_WIDTHS)
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, max_image_size=WIDTH_PX)
+    extraction.sift.max_num_features = FEATURES
     pycolmap.extract_features(
         database, work / FRAMES, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reading, extraction_options=extraction
     )
     tell("matching photographs", 0, 1)
-    pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=8, quadratic_overlap=True))
+    pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True))
     tell("registering photographs", 0, 1)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=FEWEST, num_threads=threads)
     mapper = options.mapper
