@@ -121,8 +121,13 @@ def measure_drive(
         renderers: Name to what makes a session of it; every camera gets its own.
         judges: Networks.
         report: Called with renderer and camera, frames done and all.
+
+    Raises:
+        InputError: Nothing to measure, or a renderer of blocks of frames.
     """
     tell = report or (lambda what, done, all: None)
+    for make in renderers.values():  # before anything is rendered
+        _refuse_blocks(make())
     shots = shots_of(scenario)
     rows = []
     for renderer, make in renderers.items():
@@ -133,14 +138,18 @@ def measure_drive(
     return rows
 
 
-def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]) -> list[U8]:
-    """Return a picture for each photograph.
+def _refuse_blocks(renderer: Renderer) -> None:
+    """Refuse a renderer that makes blocks of frames, or needs to know later ones.
 
     Raises:
-        InputError: The renderer makes blocks of frames, or needs to know later ones.
+        InputError: It is one.
     """
     if renderer.block is not None or renderer.lookahead:
         raise InputError(DOING, type(renderer).__name__, "a renderer of blocks of frames", "name renderers that make one frame at a time")
+
+
+def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]) -> list[U8]:
+    """Return a picture for each photograph."""
     frames = []
     for i, shot in enumerate(taken):
         frames.append(renderer.render(_request(scenario, shot)).rgb)
