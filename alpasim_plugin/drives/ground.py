@@ -16,7 +16,8 @@ from alpasim_plugin.drives.source import Points
 
 # In camera heights:
 STEP, AHEAD = 0.3, 25.0  # of the path's samples; how far the strip goes on before and beyond the path, straight on
-CONE = 1.0  # points beside the path by less than they lie below the camera are on what was driven over, for the most part
+# Points beside the path by less than they lie below it are on what was driven over, for the most part; the wider cone is for few points.
+CONES = (1.0, 1.6)
 STRIP = 1.6  # half the width of the strip that is fitted
 KNOTS, TILT_KNOTS, CROSS_KNOTS = 2.0, 8.0, 0.4  # distance of the knots of height, of cross slope, and of the road's cross section
 BEND, RISE = 0.03, 0.02  # usual second and first difference of the heights at knots, against the path
@@ -132,8 +133,10 @@ def _camera_height(points: Points, path: F64) -> float | None:
     for _ in range(2):  # the path's samples should be as fine as the height that is found
         s, left, z = frame.place(points.xyz)
         below = z - points.xyz[:, 2]
-        inside = (below > 0) & (np.abs(left) < CONE * below) & (points.rise_spread < 0.1 * below) & (s > frame.s[0]) & (s < frame.s[-1])
-        if inside.sum() < FEWEST:
+        good = (below > 0) & (points.rise_spread < 0.1 * below) & (s > frame.s[0]) & (s < frame.s[-1])
+        cones = [good & (np.abs(left) < cone * below) for cone in CONES]
+        inside = next((cone for cone in cones if cone.sum() >= FEWEST), None)
+        if inside is None:
             return None
         logs = np.log(below[inside])
         bins = np.arange(logs.min() - 0.1, logs.max() + 0.15, 0.04)

@@ -94,8 +94,8 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
     steps = np.concatenate(
         [np.linspace(a, b, 8, endpoint=False) for a, b in zip(path[:-1, :2], path[1:, :2], strict=True)] + [path[-1:, :2]]
     )
-    near = scipy.spatial.KDTree(steps).query(at.reshape(-1, 2))[0].reshape(u.shape) < ASIDE_M
-    seen = down & (depth > NEAREST_M) & (depth < FARTHEST_M) & near
+    seen = down & (depth > NEAREST_M) & (depth < FARTHEST_M)
+    seen[seen] = scipy.spatial.KDTree(steps).query(at[seen], distance_upper_bound=ASIDE_M)[0] < ASIDE_M
     usual = np.array([np.median(row[ok]) if ok.any() else np.inf for row, ok in zip(depth, seen, strict=True)])
     side = np.where(np.isfinite(usual), np.maximum(np.round(camera.fx * WIDEST_M / usual), 2), 0)
     return Road(np.asarray(seen), np.asarray(side, np.float64))
