@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.renderers.cache import cache_root, cached
+from alpasim_plugin.renderers.cache import cached
 
 
 @pytest.fixture(autouse=True)
