@@ -28,7 +28,8 @@ _FIELDS = frozenset(one.name for one in fields(MetricInfo)) - {"name"}
 class MetricTable(Mapping[str, MetricInfo]):
     """Metrics by name, in the order in which reports show them after the headline ones. Never changed: adding gives another table."""
 
-    def __init__(self, metrics: Mapping[str, MetricInfo]) -> None:
+    def __init__(self, metrics: Mapping[str, MetricInfo], is_read: bool = False) -> None:
+        self._is_read = is_read  # from a run folder: what it lacks is the folder's fault
         self._metrics = {name: replace(facts, name=name) for name, facts in metrics.items()}
 
     def __getitem__(self, name: str) -> MetricInfo:
@@ -52,6 +53,7 @@ class MetricTable(Mapping[str, MetricInfo]):
 
         Raises:
             EvaluatorError: The table does not hold it.
+            InputError: The same, of the table of a run folder.
 
         Example:
             >>> METRICS.info("route_distance_m").unit
@@ -60,6 +62,9 @@ class MetricTable(Mapping[str, MetricInfo]):
             'mean'
         """
         found = self.shown(name)
+        if not found.help and self._is_read:
+            do = "give a folder that simrun wrote, or score its logs again"
+            raise InputError("reading a run folder", f"metric {name!r}", "run.json does not say what it is", do)
         if not found.help:
             do = "name it in the evaluator's `metrics`, or check the spelling"
             raise EvaluatorError("looking up a metric", f"name {name!r}", "no evaluator declares it", do)
@@ -119,7 +124,7 @@ class MetricTable(Mapping[str, MetricInfo]):
             if "limits" in known:
                 known["limits"] = tuple(known["limits"])
             stored[name] = MetricInfo(**known)
-        return cls(METRICS._metrics | stored)
+        return cls(METRICS._metrics | stored, is_read=True)
 
     def joined(self, other: MetricTable, names: Iterable[str], doing: str, who: str) -> MetricTable:
         """Return the table of two runs that are set side by side: this one's metrics, and what only the other has.

@@ -92,7 +92,7 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
     for name, rule in spec.metrics.items():
         try:
             facts = known.info(name)
-        except EvaluatorError as error:
+        except (EvaluatorError, InputError) as error:
             raise document.error(DOING, ("metrics", name), f"no metric {name!r}", "simrun list metrics prints the known ones") from error
         if rule.margin == 0.0 and facts.direction == "none":
             found = f"a margin of 0 for {name!r}, which has no better side"
@@ -183,6 +183,8 @@ def judge_sides(
         spec, stored_name, known: As for `judge`.
         stored: The same of a stored baseline.
     """
+    if not any(sides.values()):
+        raise InputError("judging a run", "its rollouts", "there are none", "give a run with rollouts")
     checks: list[Check] = []
     for policy, here in sides.items():
         there = here if stored is None else stored.get(policy, {})

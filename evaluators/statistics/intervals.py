@@ -82,6 +82,12 @@ def scaled(values: F64) -> tuple[F64, float]:
     return values / scale, scale
 
 
+def mean_of(values: F64) -> float:
+    """Return the mean of ``(n,)`` values, also where their sum is no number."""
+    x, scale = scaled(values)
+    return float(np.mean(x)) * scale
+
+
 def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
     """Return mean and t interval of independent ``(n,)`` values.
 

@@ -215,7 +215,7 @@ def difference_bounds(delta: F64, scenes: I64, metric: MetricInfo, margin: float
         return plain, guarded
     note = f"all {n} scenes are equal, so that they have no spread to go by" if are_alike(means) else ""
     method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
-    return Interval(plain.centre, *guarded, note=note, method=method), guarded
+    return Interval(plain.centre, guarded[0], guarded[1], note=note, method=method), guarded
 
 
 def flag_interval(delta: F64, scenes: I64) -> Interval:

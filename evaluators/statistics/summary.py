@@ -20,6 +20,7 @@ from evaluators.statistics.intervals import (
     clustered,
     design_effect,
     exact_rate,
+    mean_of,
     n_clusters,
     normal_half_width,
     redraws,
@@ -82,7 +83,7 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
     }
     if n == 0:
         return entry | {"reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
-    entry["mean"] = float(np.mean(values))
+    entry["mean"] = mean_of(values)
     entry["ci95"], why = normal_half_width(values)
     if why:
         entry["ci95_reason"] = why

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from alpasim_plugin.core.errors import SimrunError
 from tests.fuzz.mutate import mutate
+from tests.fuzz.together import damaged_together
 from tests.fuzz.uses import (
     Refused,
     Target,
@@ -61,8 +62,10 @@ Files = dict[str, bytes]
 
 
 def inputs(target: Target, rng: random.Random) -> Files:
-    """Return the target's files, one of them damaged."""
+    """Return the target's files, one of them damaged, or several that belong together."""
     files = valid(target)
+    if target.together is not None:
+        return target.together(files, rng)
     names = sorted({name for pattern in target.damage for name in files if Path(name).match(pattern)})
     name = rng.choice(names)
     if name.endswith(".usdz") and rng.random() < 0.85:
@@ -159,6 +162,8 @@ CORE: tuple[Target, ...] = (
     Target("run folder, report", make_run, resealed(command("report", "@/run")), REPORT),
     Target("run folder, compare", make_run, resealed(command("compare", "@/run")), REPORT[:4]),
     Target("run folder, gate", make_run, resealed(command("gate", "@/run")), REPORT[:4]),
+    *(Target(f"run folder together, {verb}", make_run, resealed(command(verb, "@/run")), together=damaged_together)
+      for verb in ("report", "compare", "gate", "aggregate", "check")),
     Target("gate and baseline", make_baseline, command("gate", "@/run", "--gate", "@/gate.yaml", "--baseline-file", "@/baseline.json"),
            ("gate.yaml", "baseline.json")),
     Target("run folder, check", make_run, command("check", "@/run"), REPORT),

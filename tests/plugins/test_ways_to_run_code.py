@@ -197,7 +197,7 @@ WAYS: dict[str, Way] = {
     "words that a shell would run": shells,
     "programs beside the command": programs,
 }  # fmt: skip
-QUICK = ("module of a library that is missing", "distribution metadata and entry points", "pickles in a run folder", "YAML tag", "weights")
+QUICK = ("distribution metadata and entry points", "pickles in a run folder", "weights")
 
 
 @pytest.fixture(scope="module")
@@ -245,10 +245,9 @@ def test_the_baits_work_where_they_are_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "\x1b]0;evil\x07", "\x1b[2J", "\u202eevil"])
 def test_text_of_a_stranger_stays_text(text: str) -> None:
     from alpasim_plugin.core.errors import InputError
-    from alpasim_plugin.core.escape import markdown, terminal, xml
+    from alpasim_plugin.core.escape import markdown, terminal
 
     said = str(InputError("reading", text, text, text))
     assert all(part.isprintable() for part in said.splitlines())
     assert terminal(text).isprintable()
     assert "<script" not in markdown(text)
-    assert "<" not in xml(text)
