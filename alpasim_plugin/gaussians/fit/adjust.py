@@ -16,7 +16,7 @@ import scipy
 
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, follow, huber, place, pose_arrays, projection_slope
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, follow, huber, place, pose_arrays, projection_slope, summed
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 ROUNDS = 12
@@ -105,12 +105,8 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     B = slope @ R[v]  # by the point
     w = huber(e)[:, None, None]
     AT, BT = A.transpose(0, 2, 1) * w, B.transpose(0, 2, 1) * w
-    U, V = np.zeros((views, 6, 6)), np.zeros((len(xyz), 3, 3))
-    ga, gb = np.zeros((views, 6)), np.zeros((len(xyz), 3))
-    np.add.at(U, v, AT @ A)
-    np.add.at(V, p, BT @ B)
-    np.add.at(ga, v, (AT @ e[..., None])[..., 0])
-    np.add.at(gb, p, (BT @ e[..., None])[..., 0])
+    U, ga = (summed(values, v, views) for values in (AT @ A, (AT @ e[..., None])[..., 0]))
+    V, gb = (summed(values, p, len(xyz)) for values in (BT @ B, (BT @ e[..., None])[..., 0]))
     off, weight = _from_given(R, t, R0, t0), np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3)
     U += np.diag(weight)
     ga += weight * off
@@ -118,8 +114,7 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     inverse = np.linalg.inv(V + 1e-6 * np.eye(3))
     H, g = _reduced(U, ga, W, inverse, gb, v, p)
     step = -np.linalg.solve(H, g).reshape(views, 6)
-    back = np.zeros_like(gb)
-    np.add.at(back, p, np.einsum("nij,ni->nj", W, step[v]))
+    back = summed(np.einsum("nij,ni->nj", W, step[v]), p, len(xyz))
     return step, -np.einsum("nij,nj->ni", inverse, gb + back)
 
 

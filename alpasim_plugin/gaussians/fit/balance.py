@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.types import F32, F64, I64
+from alpasim_plugin.core.types import F32, F64, I64, U8
 from alpasim_plugin.gaussians.fit.tracks import Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
 
@@ -47,7 +47,7 @@ def gain_between(centres: F64, gains: F64, place: F64) -> F32:
     return np.asarray(weight @ gains[near] / weight.sum(), np.float32)
 
 
-def _patch(rgb: F32, at: F64) -> F64:
+def _patch(rgb: U8, at: F64) -> F64:
     patch = cv2.getRectSubPix(rgb, (PATCH_PX, PATCH_PX), (float(at[0] - 0.5), float(at[1] - 0.5)))
     return np.asarray(patch.reshape(-1, 3).mean(axis=0), dtype=np.float64)
 

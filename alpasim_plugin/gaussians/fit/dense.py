@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.types import F32, F64, Bool
+from alpasim_plugin.core.types import F32, F64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -53,7 +53,7 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
         tracks: Over the same views.
         placed: Their points.
     """
-    greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
+    greys = [np.asarray(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for view in views]
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # type: ignore[attr-defined]
     flow.setFinestScale(1)
     out = []
@@ -93,7 +93,7 @@ class _Seen:
     ok: Bool  # (h, w)
 
     @classmethod
-    def by_flow(cls, camera: PinholeCamera, other: PinholeCamera, grey: F32, there: F32, guess: F32, flow: cv2.DISOpticalFlow) -> _Seen:
+    def by_flow(cls, camera: PinholeCamera, other: PinholeCamera, grey: U8, there: U8, guess: F32, flow: cv2.DISOpticalFlow) -> _Seen:
         """Warp the neighbour by the guess, find the rest by flow."""
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32) + np.float32(0.5)
         T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)

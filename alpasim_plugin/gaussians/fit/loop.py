@@ -268,7 +268,7 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
 
     for view in views:
-        for array in (view.rgb, view.camera.K, view.camera.T_camera_world, view.sky, view.mask, np.array(view.gain)):
+        for array in (view.rgb, view.camera.K, view.camera.T_camera_world, view.sky, view.mask, view.depth, np.array(view.gain)):
             add(array)
         for name, T in sorted(view.actors.items()):
             digest.update(name.encode())

@@ -113,7 +113,7 @@ class SplatRecipe:
     def street(cls) -> SplatRecipe:
         """Return the recipe of a recorded street: what three minutes of two cores allow (docs/experiments/real-fit.md)."""
         return cls(
-            steps=1800, points=50_000, cap=80_000, start_size=0.8, coarse_share=0.5, depth_weight=0.05, needle_weight=0.02,
+            steps=1300, points=50_000, cap=80_000, start_size=0.8, coarse_share=0.5, depth_weight=0.05, needle_weight=0.02,
             lr_exposure=1e-3, sky_weight=0.2,
         )  # fmt: skip
 

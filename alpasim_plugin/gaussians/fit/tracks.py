@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 
-from alpasim_plugin.core.types import F64, I64, U8, Bool
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
 
@@ -68,9 +69,7 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     return all_.only(np.ones(len(order), dtype=bool))
 
 
-def _corners(
-    grey: U8, taken: np.ndarray[tuple[int, ...], np.dtype[np.float32]], mask: Bool | None
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def _corners(grey: U8, taken: F32, mask: Bool | None) -> F32:
     free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
     for x, y in np.rint(taken).astype(int):
         cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
@@ -78,9 +77,7 @@ def _corners(
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
 
-def _followed(
-    a: U8, b: U8, points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float32]], Bool]:
+def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
     there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points[:, None], None, winSize=WINDOW, maxLevel=4)  # type: ignore[call-overload]
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=WINDOW, maxLevel=4)
     off = np.linalg.norm(back[:, 0] - points, axis=1)
@@ -112,17 +109,13 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
     ray = np.einsum("nji,nj->ni", R[tracks.view], local)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None]
-    A, b = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
-    np.add.at(A, tracks.point, across)
-    np.add.at(b, tracks.point, np.einsum("nij,nj->ni", across, centre[tracks.view]))
+    A, b = (summed(values, tracks.point, tracks.count) for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view])))
     xyz = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
     for _ in range(ROUNDS):
         e, J, _ = residuals(xyz, tracks, R, t, K)
         w = huber(e)
         JT = J.transpose(0, 2, 1) * w[:, None, None]
-        H, g = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
-        np.add.at(H, tracks.point, JT @ J)
-        np.add.at(g, tracks.point, (JT @ e[..., None])[..., 0])
+        H, g = (summed(values, tracks.point, tracks.count) for values in (JT @ J, (JT @ e[..., None])[..., 0]))
         step = np.linalg.solve(H + 1e-9 * np.eye(3) * (1 + np.trace(H, axis1=1, axis2=2)[:, None, None]), g[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         away = np.linalg.norm(xyz - centre.mean(axis=0), axis=1, keepdims=True)
@@ -155,6 +148,13 @@ def projection_slope(local: F64, z: F64, f: F64) -> F64:
     J[:, 0, 0], J[:, 1, 1] = f[:, 0] / z, f[:, 1] / z
     J[:, :, 2] = -f * local[:, :2] / (z**2)[:, None]
     return J
+
+
+def summed(values: F64, index: I64, count: int) -> F64:
+    """Return the sums ``(count, ...)`` of the ``values (M, ...)`` of each index ``(M,)``."""
+    gather = scipy.sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+    return np.asarray(gather @ flat, np.float64).reshape(count, *values.shape[1:])
 
 
 def huber(e: F64) -> F64:

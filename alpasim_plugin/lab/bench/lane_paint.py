@@ -1,9 +1,9 @@
 """Lane paint in pictures: which pixels are painted, and how much of it was invented or lost.
 
 A pixel is paint where the road is seen and it is brighter than the road on both its sides along the row, which must be alike: the
-symmetrical local threshold, best of the comparison by Veit et al. (ITSC 2008). Brightness is the mean of red and green, so that white and
-yellow count alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The detector is simple on purpose
-and the same for the photograph and for what is measured: a kerb's bright edge is paint in both.
+symmetrical local threshold, best of the comparison by Veit et al. (ITSC 2008), here with medians. Brightness is the mean of red and green,
+so that white and yellow count alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The detector is
+simple on purpose and the same for the photograph and for what is measured: a kerb's bright edge is paint in both.
 
 Precision is the share of the painted pixels of a picture that lie within `TOLERANCE_PX` of a painted pixel of the photograph; recall is the
 share of the photograph's that lie so near to one of the picture. Paint that is nowhere in the photograph is invented: 1 - precision.
@@ -94,8 +94,8 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
     steps = np.concatenate(
         [np.linspace(a, b, 8, endpoint=False) for a, b in zip(path[:-1, :2], path[1:, :2], strict=True)] + [path[-1:, :2]]
     )
-    near = scipy.spatial.KDTree(steps).query(at.reshape(-1, 2))[0].reshape(u.shape) < ASIDE_M
-    seen = down & (depth > NEAREST_M) & (depth < FARTHEST_M) & near
+    seen = down & (depth > NEAREST_M) & (depth < FARTHEST_M)
+    seen[seen] = scipy.spatial.KDTree(steps).query(at[seen], distance_upper_bound=ASIDE_M)[0] < ASIDE_M
     usual = np.array([np.median(row[ok]) if ok.any() else np.inf for row, ok in zip(depth, seen, strict=True)])
     side = np.where(np.isfinite(usual), np.maximum(np.round(camera.fx * WIDEST_M / usual), 2), 0)
     return Road(np.asarray(seen), np.asarray(side, np.float64))
@@ -113,11 +113,14 @@ def paint_of(rgb: U8, road: Road) -> Bool:
 
 
 def _brighter(row: F64, side: int) -> Bool:
-    """Return where a row is brighter than its surroundings ``side`` to ``2 side`` pixels to the left and to the right, which are alike."""
-    total = np.concatenate([[0.0], np.cumsum(np.pad(row, 2 * side, mode="edge"))])
-    i = np.arange(len(row)) + 2 * side
-    left = (total[i - side] - total[i - 2 * side]) / side
-    right = (total[i + 2 * side + 1] - total[i + side + 1]) / side
+    """Return where a row is brighter than its surroundings ``side`` to ``2 side`` pixels to the left and to the right, which are alike.
+
+    The surroundings' brightness is a median: the other line of a double one lies there and must not count as road.
+    """
+    wide = np.pad(row, 2 * side, mode="edge")
+    middle = np.median(np.lib.stride_tricks.sliding_window_view(wide, side), axis=1)
+    i = np.arange(len(row))
+    left, right = middle[i], middle[i + 3 * side + 1]
     alike = np.abs(left - right) < CONTRAST_LEVELS
     return np.asarray((row > left + CONTRAST_LEVELS) & (row > right + CONTRAST_LEVELS) & alike)
 

@@ -20,7 +20,7 @@ from alpasim_plugin.core.types import F64, U8, CameraSpec, Photograph, RenderReq
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
-from alpasim_plugin.lab.bench.lane_paint import PaintCounts, compare_paint, road_of
+from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance, picture_distances
 from alpasim_plugin.lab.video_metrics.warp import warp_l1
 from alpasim_plugin.plugins.interfaces import Renderer
@@ -44,12 +44,14 @@ class Shot:
         camera: Where it was taken from.
         rgb: ``(H, W, 3)``.
         distance_m: From the path along which the photographs of the fit were taken.
+        road: Where it shows the road.
     """
 
     photograph: Photograph
     camera: PinholeCamera
     rgb: U8
     distance_m: float
+    road: Road
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +62,8 @@ class Judges:
     vdp: ColourVideoVDP | None
 
 
-def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
-    """Return the photographs of every camera that has some the fit never saw, in order of time.
+def unseen_cameras(scenario: Scenario) -> list[str]:
+    """Return the cameras that took photographs which the fit never saw.
 
     Raises:
         InputError: The scenario is no imported drive, or its fit saw every photograph.
@@ -69,12 +71,20 @@ def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
     if scenario.model is None:
         do = "give a drive that was imported: simrun import drive FOLDER -o OUT"
         raise InputError(DOING, scenario.scene_id, "no recorded drive: it has no photographs", do)
-    path = np.array([one.T_world_camera[:3, 3] for one in scenario.recording if one.use == "fitted"]).reshape(-1, 3)
     cameras = sorted({one.camera for one in scenario.recording if one.use in SETS})
-    if not cameras or len(path) < 2:
+    if not cameras or sum(one.use == "fitted" for one in scenario.recording) < 2:
         do = "import it again: every eighth photograph is held out where there are eight"
         raise InputError(DOING, scenario.scene_id, "no photograph that the fit did not see", do)
-    taken = {name: sorted((p for p in scenario.recording if p.camera == name), key=lambda p: p.t_us) for name in cameras}
+    return cameras
+
+
+def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
+    """Return all photographs of every camera of `unseen_cameras`, in order of time."""
+    path = np.array([one.T_world_camera[:3, 3] for one in scenario.recording if one.use == "fitted"])
+    taken = {
+        name: sorted((one for one in scenario.recording if one.camera == name), key=lambda one: one.t_us)
+        for name in unseen_cameras(scenario)
+    }  # fmt: skip
     return {name: [_shot(scenario, one, path) for one in photographs] for name, photographs in taken.items()}
 
 
@@ -85,7 +95,8 @@ def _shot(scenario: Scenario, one: Photograph, path: F64) -> Shot:
     top = (camera.height - kept) // 2
     K = camera.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
     cut = PinholeCamera(camera.width, kept, K, camera.T_camera_world)
-    return Shot(one, cut, np.ascontiguousarray(rgb[top : top + kept]), _distance(path, one.T_world_camera[:3, 3]))
+    road = road_of(cut, scenario.ground, scenario.ego_log.xyz)
+    return Shot(one, cut, np.ascontiguousarray(rgb[top : top + kept]), _distance(path, one.T_world_camera[:3, 3]), road)
 
 
 def _distance(path: F64, place: F64) -> float:
@@ -110,26 +121,35 @@ def measure_drive(
         renderers: Name to what makes a session of it; every camera gets its own.
         judges: Networks.
         report: Called with renderer and camera, frames done and all.
+
+    Raises:
+        InputError: Nothing to measure, or a renderer of blocks of frames.
     """
     tell = report or (lambda what, done, all: None)
+    for make in renderers.values():  # before anything is rendered
+        _refuse_blocks(make())
     shots = shots_of(scenario)
     rows = []
     for renderer, make in renderers.items():
         for camera, taken in shots.items():
             made = _rendered(scenario, make(), taken, lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n))  # type: ignore[misc]
             for use in SETS:
-                rows += _rows(name, renderer, camera, use, scenario, taken, made, judges)
+                rows += _rows(name, renderer, camera, use, taken, made, judges)
     return rows
 
 
-def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]) -> list[U8]:
-    """Return a picture for each photograph.
+def _refuse_blocks(renderer: Renderer) -> None:
+    """Refuse a renderer that makes blocks of frames, or needs to know later ones.
 
     Raises:
-        InputError: The renderer makes blocks of frames, or needs to know later ones.
+        InputError: It is one.
     """
     if renderer.block is not None or renderer.lookahead:
         raise InputError(DOING, type(renderer).__name__, "a renderer of blocks of frames", "name renderers that make one frame at a time")
+
+
+def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]) -> list[U8]:
+    """Return a picture for each photograph."""
     frames = []
     for i, shot in enumerate(taken):
         frames.append(renderer.render(_request(scenario, shot)).rgb)
@@ -144,9 +164,7 @@ def _request(scenario: Scenario, shot: Shot) -> RenderRequest:
     return RenderRequest(one.t_us, spec, np.stack([one.T_world_camera, one.T_world_camera]), log_actors(scenario, one.t_us))
 
 
-def _rows(
-    drive: str, renderer: str, camera: str, use: str, scenario: Scenario, taken: Sequence[Shot], made: Sequence[U8], judges: Judges
-) -> list[Row]:
+def _rows(drive: str, renderer: str, camera: str, use: str, taken: Sequence[Shot], made: Sequence[U8], judges: Judges) -> list[Row]:
     chosen = [i for i, shot in enumerate(taken) if shot.photograph.use == use]
     bins = np.searchsorted(BIN_M, [taken[i].distance_m for i in chosen])
     rows: list[Row] = []
@@ -154,17 +172,16 @@ def _rows(
         part = [i for i, b in zip(chosen, bins, strict=True) if b == number]
         distance = float(np.mean([taken[i].distance_m for i in part]))
         head: Row = {"drive": drive, "renderer": renderer, "camera": camera, "set": use, "distance_m": round(distance, 3)}
-        rows.append({**head, "n_frames": len(part), **_values(scenario, taken, made, part, judges)})
+        rows.append({**head, "n_frames": len(part), **_values(taken, made, part, judges)})
     return rows
 
 
-def _values(scenario: Scenario, taken: Sequence[Shot], made: Sequence[U8], part: Sequence[int], judges: Judges) -> Row:
+def _values(taken: Sequence[Shot], made: Sequence[U8], part: Sequence[int], judges: Judges) -> Row:
     truth, shown = np.stack([taken[i].rgb for i in part]), np.stack([made[i] for i in part])
     pairs = [warp_l1(np.stack([made[i - 1], made[i]]))[0] for i in part if i > 0]
     paint = PaintCounts()
     for i in part:
-        road = road_of(taken[i].camera, scenario.ground, scenario.ego_log.xyz)
-        paint += compare_paint(made[i], taken[i].rgb, road)
+        paint += compare_paint(made[i], taken[i].rgb, taken[i].road)
     return {
         "psnr_db": _mean([psnr_db(a, b) for a, b in zip(shown, truth, strict=True)]),
         "ssim": _mean([ssim(a, b) for a, b in zip(shown, truth, strict=True)]),

@@ -14,12 +14,13 @@ from rich.console import Console
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
-from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, shots_of
+from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, unseen_cameras
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
 from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.plugins.parts import RendererSpec, resolve_renderer
+from alpasim_plugin.runtime.cell import make_renderer
 from scenarios.load import load_scenario
 
 EPILOG = """
@@ -46,16 +47,17 @@ def real(
     PSNR, SSIM, perceptual-syn, ColorVideoVDP (where cvvdp is installed), Warp L1, and precision and recall of lane paint.
     """
     del debug
+    specs = {name: resolve_renderer(name) for name in _names(renderers)}
     scenarios = _loaded(drives)
     for scenario in scenarios.values():
-        shots_of(scenario)  # what cannot be measured is refused before anything is rendered
+        unseen_cameras(scenario)  # what cannot be measured is refused before anything is rendered
     vdp, why_not = load_metric()
     judges, console = Judges(load_distance(NAME), vdp), Console(stderr=True)
     if why_not:
         console.print(why_not, highlight=False)
     rows: list[Row] = []
     for name, scenario in scenarios.items():
-        makers = {part: _maker(part, scenario, seed, device, threads) for part in _names(renderers)}
+        makers = {part: _maker(spec, scenario, seed, device, threads) for part, spec in specs.items()}
         rows += measure_drive(name, scenario, makers, judges, partial(_tell, console, name))
     over = intervals(rows)
     if len(scenarios) == 1:
@@ -86,8 +88,8 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _maker(name: str, scenario: Scenario, seed: int, device: str, threads: int | None) -> Callable[[], Renderer]:
-    return lambda: make_renderer(name, scenario, seed, device, threads)
+def _maker(spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None) -> Callable[[], Renderer]:
+    return lambda: make_renderer(spec, scenario, seed, device, threads)
 
 
 def _tell(console: Console, drive: str, what: str, done: int, all: int) -> None:

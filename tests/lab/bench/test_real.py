@@ -95,14 +95,20 @@ def test_the_command_prints_one_document(drive: Scenario, monkeypatch: pytest.Mo
     monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": drive})
     monkeypatch.setattr(bench_real, "load_metric", lambda: (None, "cvvdp_jod is not measured: there is no module 'pycvvdp'"))
     monkeypatch.setattr(bench_real, "load_distance", lambda name: Difference())
-    assert run_command(["bench", "real", "d", "--renderer", "3dgs", "--json", "--threads", "1", "--seed", "1", "--device", "cpu"]) == 0
+    assert (
+        run_command(["bench", "real", "d", "--renderer", "3dgs,onefixer", "--json", "--threads", "1", "--seed", "1", "--device", "cpu"])
+        == 0
+    )
     out, err = capsys.readouterr()
     document = json.loads(out)
     assert list(document) == ["rows"]
-    assert [list(row) for row in document["rows"]] == [KEYS] * 2
+    assert [list(row) for row in document["rows"]] == [KEYS] * 4
+    assert [row["renderer"] for row in document["rows"]] == ["3dgs", "3dgs", "onefixer", "onefixer"]
+    assert document["rows"][2]["psnr_db"] > 12
     assert "one drive: no interval" in err
     assert "cvvdp_jod is not measured" in err
     assert run_command(["bench", "real", "d", "--renderer", "3dgs,3dgs"]) == 2
+    assert run_command(["bench", "real", "d", "--renderer", "3dgs,onefixr"]) == 2
 
 
 def test_a_drive_twice_and_a_missing_one_are_refused(tmp_path: Path) -> None:
