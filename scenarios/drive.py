@@ -39,8 +39,8 @@ from scenarios.recorded import RecordedLog, checked_trajectory, stands_still
 DRIVE_FILE, TRANSFORMS_FILE, GROUND_FILE, MODEL_FOLDER = "drive.json", "transforms.json", "ground.npy", "model"
 DOING = "reading an imported drive"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
-VERSION = 1
-Numbers, Rows = list[float], list[list[float]]
+Numbers = list[float]
+Rows = list[list[float]]
 
 
 class _Poses(TypedDict):
@@ -182,7 +182,7 @@ def write_drive(folder: Path, log: RecordedLog, tracks: Sequence[Actor], obstacl
     box = log.vehicle.box
     document: DriveDocument = {
         "format": "simrun drive",
-        "version": VERSION,
+        "version": 1,
         "scene_id": log.scene_id,
         "ego": _poses(log.ego_log),
         "vehicle": {

@@ -209,7 +209,7 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     if rough.strip is None:
         return points
     T = rough.T_world_source
-    return points.joined(road_points(front, rough.poses[drive.front], rough.strip).moved(np.linalg.inv(T)))
+    return points.joined(road_points(front, rough.poses[drive.front], rough.strip).moved(np.asarray(np.linalg.inv(T), dtype=np.float64)))
 
 
 def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
@@ -265,9 +265,10 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
     ego = replace(placed.ego, t_us=placed.ego.t_us - first_us)
     only_moved = drive.metric is not None and np.allclose(placed.T_world_source[:3, :3], np.eye(3))
     origin = placed.T_world_source[:3, 3] if only_moved else np.zeros(3)  # a turned frame has no origin to subtract
+    x, y, z = (-float(value) for value in origin)
     cameras = [_camera(drive, placed, name) for name in drive.cameras if name not in drive.never_fitted and name in placed.mounts]
     return RecordedLog(
-        scene_id, "drive", roads, placed.ground, ego, Vehicle(), (), tuple(cameras), (-origin[0], -origin[1], -origin[2]), "",
+        scene_id, "drive", roads, placed.ground, ego, Vehicle(), (), tuple(cameras), (x, y, z), "",
         notes=(*drive.notes, *placed.notes),
     )  # fmt: skip
 

@@ -26,7 +26,7 @@ NOISE = 0.015  # of a surface
 LOOSE, TIGHT, ROUNDS = 0.3, 0.06, 10  # where Tukey's weight ends, in the first round and in the last ones
 WHEELS, ASIDE_WEIGHT = 0.8, 0.02  # half the width of what is driven over, and what points beside it count: kerbs come and go
 FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are judged
-CROSS_AT = np.arange(-4, 5) * CROSS_KNOTS  # offsets of the cross section's knots
+CROSS_AT: F64 = np.asarray(np.arange(-4, 5) * CROSS_KNOTS, dtype=np.float64)  # offsets of the cross section's knots
 CELL_M, BESIDE_M, TILTED_M = 1.0, 60.0, 6.0  # of the height field; beyond TILTED_M beside the path it goes on level
 
 
@@ -118,10 +118,11 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     weight = np.where(np.abs(left[near]) < WHEELS, 1.0, ASIDE_WEIGHT) / (spread[near] ** 2 + NOISE**2)
     coefficients, kept = fitted.solve(s[near], left[near], h[near], weight)
     errors = _section_errors(s[near], left[near], h[near] - fitted.value(s[near], left[near], coefficients), spread[near])
+    offsets: F64 = np.asarray(CROSS_AT * height, dtype=np.float64)
     below, tilt, cross = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
     own = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)
     return GroundStrip(
-        frame, -float(np.median(own)) * height, fitted.knots * height, below * height, fitted.tilt_knots * height, tilt, CROSS_AT * height,
+        frame, -float(np.median(own)) * height, fitted.knots * height, below * height, fitted.tilt_knots * height, tilt, offsets,
         cross * height, int(kept.sum()), errors * height,
     )  # fmt: skip
 

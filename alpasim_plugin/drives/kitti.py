@@ -133,8 +133,8 @@ def _times(folder: Path, count: int) -> list[int]:
     path = folder / "times.txt"
     if not path.is_file():
         return [i * PERIOD_US for i in range(count)]
-    seconds = [float(word) for word in read_text(path, DOING).split()]
-    if len(seconds) < count or (np.diff(seconds) <= 0).any() or not np.isfinite(seconds).all():
+    seconds = np.array([float(word) for word in read_text(path, DOING).split()])
+    if len(seconds) < count or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():
         found = f"{len(seconds)} times for {count} poses" if len(seconds) < count else "times that do not increase"
         raise InputError(DOING, str(path), found, "give the time of each photograph in seconds, in order")
-    return [round(1e6 * (one - seconds[0])) for one in seconds]
+    return [round(1e6 * float(one - seconds[0])) for one in seconds]

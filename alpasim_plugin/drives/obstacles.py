@@ -109,7 +109,7 @@ def _boxes(at: F64, label: F64, tops: F64, frame: PathFrame, ground: HeightField
     s, left, _ = frame.place(at)
     piece = np.floor(s / PIECE_M).astype(np.int64)
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
-    out = []
+    out: list[Obstacle] = []
     for one in np.unique(np.stack([label, piece, left > 0], axis=1).astype(np.int64), axis=0):
         mine = (label == one[0]) & (piece == one[1]) & ((left > 0) == bool(one[2]))
         k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))

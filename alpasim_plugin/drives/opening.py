@@ -81,7 +81,11 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     metric = "the file's word that its unit is the metre" if document.get("unit") == "m" else None
     points = document.get("ply_file_path")
     cloud = None if points is None else read_points(folder / str(points))
-    given = None if cloud is None else Points(cloud.means, np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1), np.zeros((len(cloud), 3, 3)))
+    given = (
+        None
+        if cloud is None
+        else Points(np.asarray(cloud.means, dtype=np.float64), np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1), np.zeros((len(cloud), 3, 3)))
+    )
     return SourceDrive("transforms", folder.resolve().name, tuple(pictures), front, kept, metric, points=given, notes=tuple(notes))
 
 

@@ -15,7 +15,7 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, transform_points
-from alpasim_plugin.core.types import F64, I64, U8, Bool
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.drives.ground import GroundStrip
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -79,7 +79,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
 
 
 def _colour(view: PosedView, at: F64) -> F64:
-    row, column = np.clip(at[::-1].astype(np.int64), 0, [view.camera.height - 1, view.camera.width - 1])
+    row, column = min(int(at[1]), view.camera.height - 1), min(int(at[0]), view.camera.width - 1)
     return np.asarray(view.rgb[row, column] / 255.0)
 
 
@@ -178,7 +178,7 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
     if not len(at):
         return np.zeros((0, 4))
     normal, away = _plane(pieces[0], camera.T_camera_world)
-    rows = [_rows(np.arange(len(at)), i, at)]
+    rows = [_rows(np.arange(len(at)), i, at.astype(np.float64))]
     for j in (i + k for k in NEXT if i + k < len(shots)):
         other, shown = shots[j]
         move = other.T_camera_world @ inverse(camera.T_camera_world)
@@ -203,7 +203,7 @@ def _rows(track: I64, view: int, at: F64) -> F64:
     return np.column_stack([track, np.full(len(at), view), at + 0.5])
 
 
-def _flow(image: U8, warped: U8, at: F64) -> tuple[F64, Bool]:
+def _flow(image: U8, warped: U8, at: F32) -> tuple[F32, Bool]:
     """Return where points moved to, and which came back to where they were."""
     options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": 2}
     moved, found, _ = cv2.calcOpticalFlowPyrLK(image, warped, at, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options)  # type: ignore[call-overload]

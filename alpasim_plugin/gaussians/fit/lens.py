@@ -63,10 +63,10 @@ class Lens:
         """Return an image ``(H, W[, 3])`` freed of the distortion."""
         if not self.bends:
             return image
-        maps = (cv2.fisheye if self.model == "fisheye" else cv2).initUndistortRectifyMap(
+        x, y = (cv2.fisheye if self.model == "fisheye" else cv2).initUndistortRectifyMap(
             self.K - _FROM_CORNER, self.distortion, np.eye(3), self.straight_K() - _FROM_CORNER, (self.width, self.height), cv2.CV_32FC1
         )
-        return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
+        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def resized(self, width: int) -> Lens:
         """Return the lens of the same photograph at another width, pixels."""

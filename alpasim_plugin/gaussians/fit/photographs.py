@@ -243,7 +243,7 @@ def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 def _picture(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> Picture:
     file, camera = _file(folder, frame, "file_path", where), frame.get("camera")
-    t_us = as_shape(int | None, frame.get("t_us"), f"{where}, t_us", DOING)
+    t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us", DOING)
     pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
     return Picture(file, _lens(frame, file, where), pose, where, t_us, None if camera is None else str(camera), frame)
 
