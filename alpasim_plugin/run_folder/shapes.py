@@ -197,6 +197,7 @@ class Summary(TypedDict, total=False):
     metrics: dict[str, dict[str, Mean]]
     paired: dict[str, dict[str, Difference]]
     paired_with_base: dict[str, dict[str, Difference]]
+    paired_arms: dict[str, dict[str, Difference]]
     censoring: dict[str, Censoring]
     failures: Failures
     speed: dict[str, Speed]
@@ -263,5 +264,6 @@ class SceneFile(TypedDict, total=False):
 
 
 def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """List the tables of paired differences with the variant of each: against the baseline, then fixers against their base."""
-    return [(variant, pairs) for key in ("paired", "paired_with_base") for variant, pairs in (summary.get(key) or {}).items() if pairs]
+    """List the tables of paired differences with the variant of each: renderers, fixers against their base, then policies."""
+    keys = ("paired", "paired_with_base", "paired_arms")
+    return [(variant, pairs) for key in keys for variant, pairs in (summary.get(key) or {}).items() if pairs]
