@@ -190,10 +190,36 @@ class Failures(TypedDict, total=False):
     cells: list[FailedCell]
 
 
+class Place(TypedDict):
+    """A drive with an outcome."""
+
+    scene: str
+    seed: int
+    t_s: Number
+
+
+class Counted(TypedDict):
+    """How often an outcome came."""
+
+    n: int
+    cells: list[Place]
+
+
+class Ended(TypedDict):
+    """How the drives of an arm ended."""
+
+    n_rollouts: int
+    n_ended: int
+    n_failed: int
+    n_reached_end: int
+    outcomes: dict[str, Counted]
+
+
 class Summary(TypedDict, total=False):
     """``summary.json``."""
 
     preset: str
+    outcomes: dict[str, Ended]
     metrics: dict[str, dict[str, Mean]]
     paired: dict[str, dict[str, Difference]]
     paired_with_base: dict[str, dict[str, Difference]]

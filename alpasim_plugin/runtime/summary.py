@@ -22,6 +22,7 @@ from alpasim_plugin.runtime.recorder import plan_table
 from evaluators import censoring
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.statistics.arms import arms_of, base_named
+from evaluators.statistics.outcomes import outcome_table, rollouts_of
 from evaluators.statistics.summary import NO_BASES, by_policy, numbers
 
 
@@ -50,6 +51,7 @@ def write_summary(
     done = [m for m in manifests if m["status"] == "ok"]
     summary = {
         "preset": preset,
+        "outcomes": outcome_table(*rollouts_of(manifests)),
         **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": _failures(manifests),

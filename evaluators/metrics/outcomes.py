@@ -128,10 +128,14 @@ def _slow(rollout: RolloutLog, preset: Preset, line: F64, recorded_us: I64, s: F
     fastest = np.maximum.accumulate(np.where(engaged, v, 0.0))
     along, then = arc_lengths(line), (recorded_us - recorded_us[0]) * 1e-6
     usual, pause_s = recorded_speed(along, then, speeds(then, line), s)
-    excused = _recently(actor_ahead(rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest), seconds) | (s >= along[-1] - AHEAD_M)
-    stood_s = _lasting(engaged & (v < STAND_MPS) & ~excused, seconds)
     expected = np.minimum(fastest, usual)
-    slow_s = _lasting(engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected) & ~excused, seconds)
+    stands = engaged & (v < STAND_MPS)
+    slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
+    ahead = np.zeros(len(t_us), dtype=np.bool_)
+    asked = np.flatnonzero(_recently((stands | slow)[::-1], -seconds[::-1])[::-1])  # what comes before a slow step may excuse it
+    ahead[asked] = actor_ahead(rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, asked)
+    excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
+    stood_s, slow_s = _lasting(stands & ~excused, seconds), _lasting(slow & ~excused, seconds)
     return stood_s >= STAND_S + pause_s, slow_s >= SLOW_S
 
 
@@ -161,8 +165,8 @@ def recorded_speed(along: F64, seconds: F64, v: F64, s: F64) -> tuple[F64, F64]:
     return np.array([v[w].min() for w in windows]), np.array([dwell[w][v[w] < LEAST_MPS].sum() for w in windows])
 
 
-def actor_ahead(rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m: F64) -> Bool:
-    """Return at which steps ``(T,)`` a road user is on the recorded path ahead of the ego, or is about to be.
+def actor_ahead(rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m: F64, steps: I64) -> Bool:
+    """Return at which of some steps ``(K,)`` a road user is on the recorded path ahead of the ego, or is about to be.
 
     Args:
         rollout: The log.
@@ -170,15 +174,17 @@ def actor_ahead(rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m:
         line: ``(N, 2)`` the recorded path.
         s: ``(T,)`` arc length of the ego on it.
         reach_m: ``(T,)`` how far ahead counts.
+        steps: ``(K,)`` which steps are asked for.
     """
     origin = origin_of(rollout.ego_log, preset)
     actors = ActorTable(rollout, preset, origin)
-    out = np.zeros(len(s), dtype=np.bool_)
-    if len(actors) == 0 or len(line) < 2:
+    out = np.zeros(len(steps), dtype=np.bool_)
+    if len(steps) == 0 or len(actors) == 0 or len(line) < 2:
         return out
-    way, ego_xy = shapely.linestrings(line), rollout.ego.xyz[:, :2] - origin[:2]
+    way, ego_xy = shapely.linestrings(line), rollout.ego.xyz[steps, :2] - origin[:2]
+    s, reach_m = s[steps], reach_m[steps]
     for soon_s in SOON_S:
-        there = actors.at(rollout.ego.t_us + round(soon_s * 1e6))
+        there = actors.at(rollout.ego.t_us[steps] + round(soon_s * 1e6))
         actor, step = np.nonzero(there.present & (there.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None]))
         boxes = there.footprints(actor, step)
         corners = to_path(line, boxes.corners().reshape(-1, 2))[1].reshape(-1, 4)
