@@ -18,6 +18,7 @@ from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Series
 from alpasim_plugin.run_folder.schema import AGAIN, DOING
+from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
@@ -28,7 +29,7 @@ from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
-from evaluators.report.rollouts import COLLISION, read_series, rollout_block
+from evaluators.report.rollouts import read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 
@@ -171,7 +172,7 @@ def by_interest(run: Run) -> list[str]:
 
     def interest(scene: str) -> tuple[int, float]:
         rollouts = run.by_scene.get(scene, ())
-        events = sum(r.flag(*COLLISION) + r.flag("offroad") if r.ok else 1 for r in rollouts)
+        events = sum(len(outcomes_of(r)) if has_ended(r) else 1 for r in rollouts)
         far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
         return events, max(far, default=0.0)
 
