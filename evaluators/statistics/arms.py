@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.run_folder.columns import RendererColumns
 from alpasim_plugin.run_folder.schema import cell_name
+from alpasim_plugin.run_folder.sides import RendererRows, Side
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,15 @@ class Base:
         """Return every arm that has another one to be compared with, and that one."""
         known = set(arms)
         return [(arm, self.of(arm)) for arm in arms if self.of(arm) != arm and self.of(arm) in known]
+
+
+def as_policy(side: Side, policy: str) -> Side:
+    """Return rollouts as if a policy of that name had driven them, so that they pair with that policy's."""
+    if isinstance(side, RendererColumns):
+        return replace(side, cells=replace(side.cells, policy=policy))
+    if isinstance(side, RendererRows):
+        return RendererRows.of([{**row, "policy": policy} for row in side.rows])
+    raise TypeError(f"rollouts of an unknown layout, {type(side).__name__}")
 
 
 def arms_of(cells: Iterable[tuple[str, str]]) -> list[Arm]:
