@@ -82,6 +82,11 @@ def in_words(had: Iterable[str]) -> str:
     return " and ".join(one.words for one in told(had)) or NO_OUTCOME
 
 
+def event_words(metric: str) -> str:
+    """Name an event of a manifest: an outcome, or the side of a contact as the collision that it is."""
+    return OUTCOMES[metric].words if metric in OUTCOMES else OUTCOMES["collision_any"].words
+
+
 def has_ended(rollout: Rollout) -> bool:
     """Tell whether the outcome of a rollout is known: it ran to its end, or the policy broke it."""
     return rollout.ok or rollout.failure_class == POLICY_FAULT

@@ -51,6 +51,13 @@ class Base:
         return [(arm, self.of(arm)) for arm in arms if self.of(arm) != arm and self.of(arm) in known]
 
 
+def short_name(arm: Arm, other: Arm) -> str:
+    """Name an arm by what it does not share with the one that it is compared with."""
+    if arm.policy == other.policy:
+        return arm.renderer
+    return arm.policy if arm.renderer == other.renderer else arm.name
+
+
 def as_policy(side: Side, policy: str) -> Side:
     """Return rollouts as if a policy of that name had driven them, so that they pair with that policy's."""
     if isinstance(side, RendererColumns):
@@ -111,7 +118,12 @@ def usual_base(arms: Sequence[Arm], baseline: str | None = None) -> Base:
     """
     if not arms:
         return Base()
+    named = next((arm for arm in arms if arm.name == baseline), None)
+    if named is not None:
+        return Base(named.renderer, named.policy)
     by_renderer, by_policy = axis_bases(arms, baseline)
+    if by_policy is not None and baseline == by_policy.policy:
+        return by_policy
     return by_renderer or by_policy or Base(renderer=arms[0].renderer)
 
 

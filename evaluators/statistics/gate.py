@@ -17,7 +17,7 @@ from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.sides import Row, Side, by_renderer, failure_of, is_ok
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import PRESETS
-from evaluators.statistics.arms import Arm, Base, as_policy, base_named, usual_base
+from evaluators.statistics.arms import Arm, Base, as_policy, base_named, short_name, usual_base
 from evaluators.statistics.baselines import of_policy, policies_of
 from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, worst
@@ -196,7 +196,7 @@ def judge_sides(
         for name, rule in spec.metrics.items():
             metric = known.info(name)
             if rule.margin is not None:
-                checks.append(_margin(side, behind, (arm.renderer, arm.policy), _short(other, arm), metric, rule, spec))
+                checks.append(_margin(side, behind, (arm.renderer, arm.policy), short_name(other, arm), metric, rule, spec))
             if rule.max is not None or rule.min is not None:
                 checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
     found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
@@ -259,13 +259,6 @@ def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored:
     raise InputError(
         DOING_JUDGE, f"baseline {wanted.name!r}", f"{where} does not have it", f"`baseline` of the gate may be one of: {names}"
     )
-
-
-def _short(other: Arm, arm: Arm) -> str:
-    """Name an arm by what it does not share with the one that is compared with it."""
-    if other.policy == arm.policy:
-        return other.renderer
-    return other.policy if other.renderer == arm.renderer else other.name
 
 
 def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec) -> Check:

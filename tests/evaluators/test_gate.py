@@ -116,7 +116,7 @@ def test_names_that_are_not_there_are_refused():
         judge(one, gate())
     with pytest.raises(InputError, match="the run has none of these"):
         judge([*one, *rows()], gate(renderers=("onefixer",)))
-    with pytest.raises(InputError, match="choose one of: clean, 3dgs"):
+    with pytest.raises(InputError, match="choose one of clean, 3dgs"):
         judge([*one, *rows()], gate(baseline="onefixer"))
     limits = gate(metrics={"img_is_black": MetricRule(max=0.0)})
     assert judge(one, limits).exit_code == 0  # limits need no second renderer
