@@ -25,6 +25,10 @@ Examples:
 
 - `simrun compare runs/nightly --baseline clean`
 
+- `simrun compare runs/policies --baseline lane-camera`: each other policy with this one, behind each renderer
+
+- `simrun compare runs/both --baseline clean/lane-camera`: every other pair of renderer and policy with this one
+
 - `simrun compare runs/main runs/change`: the second run minus the first, on shared cells
 
 - `simrun compare runs/main runs/change --gate configs/gates/default.yaml --json`
@@ -35,7 +39,7 @@ SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
 
 def compare(
     runs: Annotated[tuple[Path, ...], Positional("One run folder, or two: the second is compared with the first.")],
-    baseline: Annotated[str | None, Flag("Renderer to compare with (of the first run).")] = None,
+    baseline: Annotated[str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")] = None,
     gate: Annotated[str | None, Flag("Take the margins from this gate file.")] = None,
     every: Every = False,
     as_json: Json = False,
@@ -65,6 +69,7 @@ def compare(
                     "notes": list(result.notes),
                     "paired": result.paired,
                     "paired_with_base": result.with_base,
+                    "paired_arms": result.arms,
                 }
             )
         )
@@ -75,7 +80,7 @@ def compare(
 def _print(result: Comparison, only: Sequence[str] | None) -> None:
     for note in result.notes:
         print(f"note: {note}")
-    for variant, entries in (*result.paired.items(), *result.with_base.items()):
+    for variant, entries in (*result.paired.items(), *result.with_base.items(), *result.arms.items()):
         mine = [row for row in pair_rows({"paired": {variant: entries}}, result.metrics) if only is None or row.metric in only]
         baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
         print(f"\n{variant} minus {baseline}")

@@ -11,17 +11,18 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from alpasim_plugin.cli.options import Care, Json, Only, Quiet, RunFolder, What, Where, check_preset
+from alpasim_plugin.cli.options import Care, Json, Only, Quiet, RunFolder, What, Where, check_preset, split_policies
 from alpasim_plugin.cli.progress import Lines, Silent, report_line
 from alpasim_plugin.cli.run import planned
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.run_folder.schema import slug
-from alpasim_plugin.runtime.decide import Decided, Design, execute_decision, key_of
+from alpasim_plugin.runtime.decide import Decided, Design, arms_asked, execute_decision, key_of
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan
 from evaluators.opening import read_run
 from evaluators.report.decision import metric_lines, verdict_line
+from evaluators.statistics.arms import Arm, arms_of, base_named, usual_base
 from evaluators.statistics.baselines import StoredSide, check_made_alike, read_baseline, rows_of_run, stored_side
 from evaluators.statistics.gate import GateSpec, load_gate
 from evaluators.statistics.sequential import control as variance
@@ -37,6 +38,8 @@ EPILOG = """
 Examples:
 
 - `simrun decide --renderer clean,3dgs suites/urban`: is 3dgs non-inferior to clean by the default gate?
+
+- `simrun decide --renderer clean --policy lane-camera,learned suites/urban`: is the second policy non-inferior to the first?
 
 - `simrun decide --renderer clean,onefixer --metric lateral_distance_m=0.1,progress=0.05 suites/all --budget 200`
 
@@ -84,11 +87,11 @@ def decide(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Drive scenes in random order until it is decided whether a renderer is worse than another.
+    """Drive scenes in random order until it is decided whether a renderer, or a policy, is worse than another.
 
-    `--renderer` names the baseline and the one in question; with `--baseline-file` the latter alone. `--seeds auto:N` takes up to N seeds
-    of a scene, chosen by cost against variance. An interrupted decision continues when the same command is given again, and decides
-    the same.
+    `--renderer` or `--policy` names the baseline and the one in question; with `--baseline-file` the latter alone. `--seeds auto:N` takes
+    up to N seeds of a scene, chosen by cost against variance. An interrupted decision continues when the same command is given again, and
+    decides the same.
     """
     check_preset(options.preset)
     spec = None if metric else load_gate(gate)[0]
@@ -148,25 +151,36 @@ def plan_of(what: What, options: RunOptions, stored: bool = False) -> RunPlan:
     """Plan all cells that may be driven.
 
     Args:
-        what: Scenes, renderers, one policy.
+        what: Scenes, and two renderers, two policies, or two of both with a baseline that names both.
         options: Of the run.
-        stored: The baseline was driven earlier: one renderer is driven.
+        stored: The baseline was driven earlier: one arm is driven.
 
     Raises:
-        InputError: Not two renderers (one, if stored) and one policy, or a scenario or part is invalid.
+        InputError: Not two arms (one, if stored), or a scenario or part is invalid.
     """
-    names = what.renderers
+    renderers, policies = what.renderers, split_policies(what.policy)
+    what_is_asked = f"--renderer {what.renderer} --policy {what.policy}"
     if stored:
-        if len(names) != 1:
-            found = f"{len(names)} renderers beside a stored baseline"
-            raise InputError(DOING, f"--renderer {what.renderer}", found, "name the one in question; the baseline is not driven again")
-        return planned(what, names, [what.policy], replace(options, baseline=None))
-    if len(names) != 2:
-        raise InputError(DOING, f"--renderer {what.renderer}", f"{len(names)} renderers", "name two: the baseline and the one in question")
-    baseline = options.baseline or names[0]
-    if baseline not in names:
-        raise InputError(DOING, f"--baseline {baseline}", f"the renderers are {', '.join(names)}", "name one of them")
-    return planned(what, names, [what.policy], replace(options, baseline=baseline))
+        if len(renderers) * len(policies) != 1:
+            found = f"{len(renderers)} renderers and {len(policies)} policies beside a stored baseline"
+            raise InputError(DOING, what_is_asked, found, "name the arm in question; the baseline is not driven again")
+        return planned(what, renderers, policies, replace(options, baseline=None))
+    if sorted((len(renderers), len(policies))) not in ([1, 2], [2, 2]):
+        found = f"{len(renderers)} renderers and {len(policies)} policies"
+        raise InputError(DOING, what_is_asked, found, "name two renderers or two policies: the baseline and the one in question")
+    plan = planned(what, renderers, policies, options)
+    arms = arms_of((renderer.name, policy.name) for policy in plan.policies for renderer in plan.renderers)
+    base = usual_base(arms) if options.baseline is None else base_named(options.baseline, arms, DOING, "the plan")
+    if len(arms) == 4:
+        if base.renderer is None or base.policy is None:
+            found = f"baseline {base.name} leaves open which of four arms is in question"
+            raise InputError(
+                DOING, what_is_asked, found, f"name one arm, as --baseline {arms[0].name}: the one in question shares nothing with it"
+            )
+        arms = [arm for arm in arms if arm == base.of(arm) or (base.renderer != arm.renderer and base.policy != arm.policy)]
+    kept = {(arm.renderer, arm.policy) for arm in arms}
+    cells = tuple(cell for cell in plan.cells if (cell.renderer.name, cell.policy.name) in kept)
+    return replace(plan, cells=cells, options=replace(plan.options, baseline=base.name))
 
 
 def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missing: float) -> StoredSide:
@@ -175,7 +189,7 @@ def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missin
     Args:
         path: The baseline's file or folder.
         plan: What may be driven, of one renderer.
-        baseline: Renderer whose rollouts are taken; None: the one that is driven.
+        baseline: RENDERER, POLICY or RENDERER/POLICY whose rollouts are taken; None: the arm that is driven.
         max_missing: Share of the plan's scenes and seeds that it may lack.
 
     Raises:
@@ -185,7 +199,10 @@ def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missin
     weights = {file: sha for part in plan.parts for file, sha in part.files.items()}
     check_made_alike(stored, plan.options.preset, {name: one.content_hash for name, one in plan.scenarios.items()}, weights, path)
     planned = {(cell.scene, cell.seed) for cell in plan.cells}
-    return stored_side(stored.rows, baseline or plan.renderers[0].name, plan.policies[0].name, planned, max_missing, path)
+    there = arms_of((str(row["renderer"]), str(row["policy"])) for row in stored.rows)
+    driven = Arm(plan.renderers[0].name, plan.policies[0].name)
+    arm = driven if baseline is None else base_named(baseline, there, DOING, str(path)).of(driven)
+    return stored_side(stored.rows, arm.renderer, arm.policy, planned, max_missing, path)
 
 
 def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None) -> tuple[MetricQuestion, ...]:
@@ -248,8 +265,10 @@ def controls_of(
     if "family" in texts and order == "stratified":
         found = "with --order stratified, families are taken out by the order"
         raise InputError(DOING, "--control family", found, "leave out one of the two")
-    scenes, baseline = list(plan.scenarios), str(plan.options.baseline) if stored is None else stored.renderer
-    candidate = next(spec.name for spec in plan.renderers if stored is not None or spec.name != baseline)
+    base, asked = arms_asked(plan, stored is not None)
+    if base.policy != asked.policy and any(text != "family" for text in texts):
+        raise InputError(DOING, "--control RUN", "two policies are compared", "take --control family: an earlier run is of two renderers")
+    scenes, baseline, candidate = list(plan.scenarios), base.renderer if stored is None else stored.renderer, asked.renderer
     paths = {cell.scene: cell.ref.path for cell in plan.cells}
     out: dict[str, Control] = {}
     for text in texts:

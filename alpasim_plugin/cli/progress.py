@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.plan import RunPlan
+from evaluators.metrics.outcomes import NO_OUTCOME, event_words
 from evaluators.report.numbers import plural
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
@@ -155,5 +156,5 @@ def describe(manifest: dict[str, Any], reused: bool) -> str:
     cell = f"{manifest['renderer']} {manifest['policy']} {manifest['scene']} seed {manifest['seed']}"
     if manifest["status"] != "ok":
         return f"{cell}: FAILED ({manifest['error']['failure_class']}) {manifest['error']['found']}"
-    events = ", ".join(event["metric"] for event in manifest.get("events", [])) or "no event"
+    events = ", ".join(dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))) or NO_OUTCOME
     return f"{cell}: {events}" + (" (reused)" if reused else f", {manifest['wall_s']:.1f} s")

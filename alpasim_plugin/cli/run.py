@@ -14,7 +14,6 @@ from rich.console import Console
 
 from alpasim_plugin.cli.options import Care, Json, Quiet, RunFolder, What, Where, check_preset, parse_seeds, split_policies
 from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_progress, report_line, varied_lines
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.run_folder.manifests import read_run_json
@@ -25,6 +24,7 @@ from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
+from evaluators.statistics.arms import arms_of, base_named
 from scenarios.library import shipped_names
 from scenarios.suite import expand
 
@@ -63,10 +63,10 @@ def run(
     """
     how = where.arguments() | care.arguments()
     check_preset(options.preset)
-    if options.baseline is not None and options.baseline not in what.renderers:
-        found = f"the run has renderers {what.renderers}"
-        raise InputError("choosing a baseline", f"--baseline {options.baseline}", found, "name one of them")
     plan = planned(what, what.renderers, split_policies(what.policy), options)
+    if options.baseline is not None:
+        arms = arms_of((renderer.name, policy.name) for policy in plan.policies for renderer in plan.renderers)
+        base_named(options.baseline, arms, "choosing a baseline", "the run")
     root = out or default_folder(plan)
     if dry_run:
         _print_plan(plan, root, thread_budget(where.workers, len(plan.cells), how["executor"]), as_json)

@@ -190,13 +190,40 @@ class Failures(TypedDict, total=False):
     cells: list[FailedCell]
 
 
+class Place(TypedDict):
+    """A drive with an outcome."""
+
+    scene: str
+    seed: int
+    t_s: Number
+
+
+class Counted(TypedDict):
+    """How often an outcome came."""
+
+    n: int
+    cells: list[Place]
+
+
+class Ended(TypedDict):
+    """How the drives of an arm ended."""
+
+    n_rollouts: int
+    n_ended: int
+    n_failed: int
+    n_reached_end: int
+    outcomes: dict[str, Counted]
+
+
 class Summary(TypedDict, total=False):
     """``summary.json``."""
 
     preset: str
+    outcomes: dict[str, Ended]
     metrics: dict[str, dict[str, Mean]]
     paired: dict[str, dict[str, Difference]]
     paired_with_base: dict[str, dict[str, Difference]]
+    paired_arms: dict[str, dict[str, Difference]]
     censoring: dict[str, Censoring]
     failures: Failures
     speed: dict[str, Speed]
@@ -263,5 +290,6 @@ class SceneFile(TypedDict, total=False):
 
 
 def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """List the tables of paired differences with the variant of each: against the baseline, then fixers against their base."""
-    return [(variant, pairs) for key in ("paired", "paired_with_base") for variant, pairs in (summary.get(key) or {}).items() if pairs]
+    """List the tables of paired differences with the variant of each: renderers, fixers against their base, then policies."""
+    keys = ("paired", "paired_with_base", "paired_arms")
+    return [(variant, pairs) for key in keys for variant, pairs in (summary.get(key) or {}).items() if pairs]

@@ -20,7 +20,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.plugins.parts import digest
 from alpasim_plugin.process.subprocesses import end_children
 from alpasim_plugin.run_folder.manifests import find_contents, read_run_json, write_run_json
-from alpasim_plugin.run_folder.sides import RendererRows, by_renderer
+from alpasim_plugin.run_folder.sides import RendererRows
 from alpasim_plugin.run_folder.writer import rollout_rows, writing
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.execute import HowToRun, execute, thread_budget
@@ -28,6 +28,7 @@ from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, kept_open
 from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
 from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, on_done, publish, write_run_info
 from alpasim_plugin.runtime.summary import pool_of
+from evaluators.statistics.arms import Arm, arms_of, as_policy, short_name, usual_base
 from evaluators.statistics.baselines import StoredSide
 from evaluators.statistics.gate import failures_of
 from evaluators.statistics.sequential.control import Control, adjusted_draws
@@ -146,8 +147,8 @@ def execute_decision(
     """Drive scenes of a plan until the question is decided or the ceiling is reached.
 
     Args:
-        plan: All cells that may be driven: two renderers, the baseline of ``plan.options`` and another (or one, with ``stored``), and one
-            policy. Its ``question`` is `key_of` the question.
+        plan: All cells that may be driven, of two arms: the baseline of ``plan.options`` and another (of one, with ``stored``). Its
+            ``question`` is `key_of` the question.
         question: What is to be decided.
         design: How scenes are drawn.
         root: The run folder; one process writes it at a time.
@@ -196,6 +197,20 @@ def execute_decision(
     return Decided(result, drawing.record(), drawing.state, drawing.outcome)
 
 
+def arms_asked(plan: RunPlan, stored: bool = False) -> tuple[Arm, Arm]:
+    """Return the baseline's arm and the one in question of a plan that has two arms, or of a stored baseline one: then both are it."""
+    arms = arms_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
+    if stored:
+        return arms[0], arms[0]
+    base = usual_base(arms, plan.options.baseline)
+    asked = next(arm for arm in arms if base.of(arm) != arm)
+    return base.of(asked), asked
+
+
+def _side(rows: Sequence[Mapping[str, Any]], arm: Arm) -> RendererRows:
+    return RendererRows.of([row for row in rows if (row["renderer"], row["policy"]) == (arm.renderer, arm.policy)])
+
+
 class _Drawing:
     """The scenes driven so far, what follows from them, and which come next."""
 
@@ -203,10 +218,10 @@ class _Drawing:
         self, plan: RunPlan, question: Question, design: Design, controls: Mapping[str, Control], stored: StoredSide | None
     ) -> None:
         self.plan, self.question, self.design, self.controls, self.stored = plan, question, design, controls, stored
-        names = [spec.name for spec in plan.renderers]
-        self.baseline = stored.name if stored is not None else plan.options.baseline or names[0]
-        (self.candidate,) = (name for name in names if stored is not None or name != self.baseline)
-        self.per_seed = len(plan.renderers)
+        self.base, self.asked = arms_asked(plan, stored is not None)
+        self.baseline = stored.name if stored is not None else short_name(self.base, self.asked)
+        self.candidate = short_name(self.asked, self.base)
+        self.per_seed = 1 if stored is not None else 2
         self.ceiling = min(design.budget or len(plan.cells), len(plan.cells))
         seeds = 1 if design.auto_seeds else len(plan.seeds)
         self.horizon = max(1, min(len(plan.scenarios), self.ceiling // (self.per_seed * seeds)))
@@ -263,13 +278,14 @@ class _Drawing:
         """Take in a batch and look."""
         self.manifests |= {cell.folder.as_posix(): manifest for cell, manifest in zip(cells, manifests, strict=True)}
         rows = rollout_rows(list(self.manifests.values()))
-        sides = by_renderer(rows)
+        candidate = _side(rows, self.asked)
         self.failed = outcome_of_failures(failures_of(rows), self.design.max_failed)
         driven = {(cell.scene, cell.seed) for cell in self.cells}
-        base = sides[self.baseline] if self.stored is None else RendererRows.of(self.stored.of_cells(driven))
+        there = _side(rows, self.base) if self.stored is None else RendererRows.of(self.stored.of_cells(driven))
+        base = as_policy(there, self.asked.policy)
         values, adjusted = {}, {}
         for one in self.question.metrics:
-            found = scene_differences(sides[self.candidate], base, one.metric, self.scenes)
+            found = scene_differences(candidate, base, one.metric, self.scenes)
             self.differences[one.metric] = found
             values[one.metric] = found.harm(one.direction)
             if self.question.population == "suite":
@@ -306,7 +322,7 @@ class _Drawing:
             "question": question_as_dict(self.question),
             "candidate": self.candidate,
             "baseline": self.baseline,
-            "policy": self.plan.policies[0].name,
+            "policy": self.asked.policy,
             "order_seed": self.design.order_seed,
             "look_every": self.design.look_every,
             "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},

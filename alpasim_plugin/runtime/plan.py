@@ -32,7 +32,7 @@ class RunOptions:
     images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = "jpeg"
     video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "none"
     device: Annotated[Literal["cpu", "cuda"], Flag("Where renderers compute.")] = "cpu"
-    baseline: Annotated[str | None, Flag("Renderer to compare against; by default the first.", names="renderer")] = None
+    baseline: Annotated[str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.", names="renderer")] = None
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
     controller: Annotated[str | None, Flag("Controller that tracks the plans; by default the policy's.", names="controller")] = None
     evaluators: Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")] = ()

@@ -19,9 +19,7 @@ from alpasim_plugin.viewer.pictures import smaller
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import read_run
 from evaluators.report import write_junit, write_report, write_summary_md
-from evaluators.report.flips import FLIPS_NAME, Flip, find_flips
-
-Key = tuple[str, str, str, int]  # renderer, policy, scene, seed
+from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips
 
 
 def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
@@ -33,7 +31,7 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
         page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an earlier command are removed, and None is
             returned.
     """
-    replays: Mapping[Key, str] = {}
+    replays: Mapping[FlipKey, str] = {}
     if flips and page:
         write_flips(root)
         replays = write_flips_page(root)
@@ -64,7 +62,7 @@ def write_flips(root: Path) -> Path:
     cells = []
     for number, flip in enumerate(flips[:MAX_FLIPS]):
         key = {"renderer": flip.other.renderer, "policy": flip.other.policy, "scene": flip.other.scene, "seed": flip.other.seed}
-        cells.append(key | {"baseline": flip.base.renderer} | _divergence(root, flip, f"flips/{number:03d}"))
+        cells.append(key | {"baseline": flip.base.renderer, "against": flip.base.variant} | _divergence(root, flip, f"flips/{number:03d}"))
     _read.cache_clear()
     about = {"threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "n_flips": len(flips), "n_pairs": compared}
     write_json(root / FLIPS_NAME, about | {"cells": cells})
@@ -72,11 +70,13 @@ def write_flips(root: Path) -> Path:
 
 
 def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
-    probe = find_probe(root, flip.base, flip.other.renderer)
+    probe = find_probe(root, flip.base, flip.other.renderer) if flip.base.policy == flip.other.policy else None
     if probe is not None:
         return dict(probe) | {"source": "probe"}
+    if not (flip.base.ok and flip.other.ok):
+        return {"t_us": None, "reason": "the policy broke off one of the drives"}
     try:
-        logs = {r.renderer: _read(root / r.path / LOG_NAME) for r in (flip.base, flip.other)}
+        logs = {name: _read(root / r.path / LOG_NAME) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)}
     except SimrunError as error:
         return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
     one, other = logs.values()
@@ -86,10 +86,10 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
     if found is None:
         return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
     divergence: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
-    frames = {renderer: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (renderer, log) in enumerate(logs.items())}
+    frames = {side: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (side, log) in enumerate(logs.items())}
     if None in frames.values():
         divergence["frames_reason"] = "a log without camera images (--images none, or a policy without cameras)"
-    return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {r: path for r, path in frames.items() if path}}
+    return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {side: path for side, path in frames.items() if path}}
 
 
 def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:

@@ -27,7 +27,7 @@ class TabulatedScores:
 
     steps: list[dict[str, Any]]  # rows of steps.parquet without the rollout's key
     metrics: dict[str, dict[str, Any]]  # metric -> value, valid, reason, unit, direction
-    events: list[dict[str, Any]]  # first scored collision and off-road: metric, t_us, x_m, y_m
+    events: list[dict[str, Any]]  # when outcomes began: metric, t_us, t_s (after the first frame), x_m, y_m
     censored: dict[str, Any]  # number of steps that each rule removed
     contacts: list[dict[str, Any]]  # contact onsets, if contact is searched between steps: actor_id, t_s, side, x_m, y_m (rig frame)
 
@@ -108,5 +108,6 @@ def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
     placed = []
     for event in reduction.events:
         at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
-        placed.append(dict(event) | {"x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)})
+        after_s = round((int(event["t_us"]) - rollout.render_start_us) * 1e-6, 3)
+        placed.append(dict(event) | {"t_s": after_s, "x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)})
     return sorted(placed, key=lambda event: (event["t_us"], event["metric"]))

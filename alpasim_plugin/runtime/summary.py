@@ -21,6 +21,8 @@ from alpasim_plugin.runtime.provenance import fixers
 from alpasim_plugin.runtime.recorder import plan_table
 from evaluators import censoring
 from evaluators.metrics import METRICS, MetricTable
+from evaluators.statistics.arms import arms_of, base_named
+from evaluators.statistics.outcomes import outcome_table, rollouts_of
 from evaluators.statistics.summary import NO_BASES, by_policy, numbers
 
 
@@ -39,7 +41,7 @@ def write_summary(
         root: The run folder; the manifests' rollouts are below it.
         manifests: One per rollout, in the order of the tables.
         preset: Evaluator preset of the scores.
-        baseline: Renderer that the others are compared with; None is the first.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the first.
         more: What the manifests do not tell, for the summary.
         bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
             baseline, the two are paired too.
@@ -49,6 +51,7 @@ def write_summary(
     done = [m for m in manifests if m["status"] == "ok"]
     summary = {
         "preset": preset,
+        "outcomes": outcome_table(*rollouts_of(manifests)),
         **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": _failures(manifests),
@@ -154,10 +157,10 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
 
     Args:
         runs: Finished run folders.
-        baseline: Renderer that the others are compared with; None is the first run's.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the first run's.
 
     Returns:
-        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``failures`` (docs/statistics.md).
+        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_arms``, ``failures`` (docs/statistics.md).
 
     Raises:
         InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a metric is another one in another run; a
@@ -171,9 +174,9 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
     _check_alike(infos)
     first = next(iter(infos.values()))
     table = RolloutTable.of_files([run / ROLLOUTS for run in runs])
-    renderers = list(dict.fromkeys(name for policy in table.policies for name in table.sides(policy)))
-    if baseline is not None and baseline not in renderers:
-        raise InputError(DOING, f"--baseline {baseline}", "no rollout has it", f"choose one of {', '.join(renderers) or 'none'}")
+    arms = arms_of((name, policy) for policy in table.policies for name in table.sides(policy))
+    if baseline is not None:
+        base_named(baseline, arms, DOING, "the runs together")
     known = _joined(infos, table.metrics)
     bases = {name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()}
     by_class = table.failures()

@@ -10,8 +10,9 @@ from typing import Annotated, Literal
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
-from evaluators.report.flips import Flip, baseline_of, events, find_flips, in_words
+from evaluators.report.flips import Flip, baseline_of, find_flips
 
 DOING = "choosing rollouts to watch"
 QUIET_CELLS = 3  # cells in which nothing happened, shown by default
@@ -52,7 +53,7 @@ class WatchedCell:
         """Say why somebody would look at it."""
         if self.flips:
             return "flip"
-        if any(events(rollout) for rollout in self.rollouts if rollout.ok):
+        if any(outcomes_of(rollout) for rollout in self.rollouts if rollout.ok):
             return "event"
         return "quiet" if all(rollout.ok for rollout in self.rollouts) else "failure"
 
@@ -70,7 +71,8 @@ class WatchedCell:
 
     def outcomes(self) -> dict[str, str]:
         """Give the outcome of each renderer in words."""
-        return {r.renderer: in_words(events(r)) if r.ok else f"failed: {r.failure_class or 'unknown'}" for r in self.rollouts}
+        failed = {r.renderer: f"failed: {r.failure_class or 'unknown'}" for r in self.rollouts if not has_ended(r)}
+        return {r.renderer: failed.get(r.renderer) or in_words(outcomes_of(r)) for r in self.rollouts}
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
         grouped.setdefault((*key, take), []).append(rollout)
     flips: dict[tuple[str, str, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
-        if _asked(flip.other, wanted):
+        if flip.base.policy == flip.other.policy and _asked(flip.other, wanted):  # a cell shows one policy behind all renderers
             flips.setdefault((flip.other.scene, flip.other.policy, flip.other.seed), []).append(flip)
     cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ()))) for key, members in grouped.items()]
     return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))  # stable: equal ones stay in the run's order

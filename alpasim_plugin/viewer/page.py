@@ -22,6 +22,7 @@ from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wan
 from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.opening import Run, read_run
+from evaluators.report.flips import FlipKey
 from evaluators.report.html import asset
 from evaluators.report.numbers import plural
 
@@ -264,7 +265,7 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
 
 
-def write_flips_page(root: Path) -> Mapping[tuple[str, str, str, int], str]:
+def write_flips_page(root: Path) -> Mapping[FlipKey, str]:
     """Write ``flips.html`` of a run folder: its changed outcomes alone, small. Without any, one of an earlier command is removed.
 
     Returns:

@@ -16,7 +16,7 @@ from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
 from evaluators.opening import Run
-from evaluators.report.flips import FLIPS_NAME, baseline_of
+from evaluators.report.flips import FLIPS_NAME, baseline_of, key_of_entry
 from evaluators.report.rollouts import clock_zero_us
 
 DOING = "reading a rollout to watch"
@@ -148,4 +148,4 @@ def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:
         return []
     keys = {flip.key for flip in cell.flips}
     entries = read_json(path).get("cells") or []
-    return [entry for entry in entries if (entry["renderer"], entry["policy"], entry["scene"], entry["seed"]) in keys]
+    return [entry for entry in entries if key_of_entry(entry) in keys]

@@ -271,6 +271,19 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
         "the ego left the recorded path to the side, by 4 m unless AlpaSim's settings say else", reference=CENTRE,
         formula="`lateral_dist_to_gt_trajectory` is 4 m or more; later `alpasim` only",
     ),
+    "left_route": _flag(
+        "the ego left the recorded path to the side by 4 m or more", label="rollouts that left the route", reference=CENTRE,
+        invalid=_SHORT, formula="`lateral_distance_m` is 4 m or more",
+    ),
+    "stalled": _flag(
+        "the ego stands although nothing is in its way and the recording drove on", label="stalled rollouts", reference=CENTRE,
+        invalid=_SHORT, formula="[stalled and braked without a cause](outcomes.md#stalled)",
+    ),
+    "braked_without_cause": _flag(
+        "the ego drives at less than half the speed of the recording there, which it had before, although nothing is in its way",
+        label="rollouts that braked without a cause", reference=CENTRE, invalid=_SHORT,
+        formula="[stalled and braked without a cause](outcomes.md#stalled)",
+    ),
     "dist_to_gt_location": _metres(
         "distance of the ego centre from where the recording is at that time", "lower", "max", margin=0.5, reference=CENTRE,
         formula="distance from `c` to `p(t)`", invalid=_UNCOVERED,

@@ -13,10 +13,11 @@ from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.metrics.outcomes import in_words, outcomes_of, told
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.headline import find
+from evaluators.report.headline import LEADING, find
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, failure_rows, ledger, provenance
 from evaluators.statistics.gate import Check, GateVerdict
@@ -48,7 +49,10 @@ def write_summary_md(run_dir: Path | str) -> Path:
 def summary_md(run: Run) -> str:
     """Render the summary as Markdown, of any length."""
     finding = find(run)
-    parts = [f"## {escape(finding.title)}\n"]
+    parts = [f"## {escape(finding.head)}\n"]
+    if len(finding.outcomes) > 1:
+        parts += [f"- **{escape(name)}**: {escape(text)}\n" for name, text in finding.outcomes[LEADING:]]
+        parts += [f"\n**{escape(finding.title)}**\n\n"]
     parts += [f"- **{escape(finding.name_of(p))}**: {escape(p.text)}\n" for p in finding.points]
     parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
@@ -138,12 +142,17 @@ def _write_xml(path: Path, root: ET.Element) -> Path:
     return path
 
 
-def junit(run: Run) -> ET.Element:
-    """Build the document."""
+def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
+    """Build the document.
+
+    Args:
+        run: The run.
+        outcomes_fail: A drive with an outcome is a failed case; otherwise the outcome is a property of the case alone.
+    """
     failed = [r for r in run.rollouts if not r.ok]
     counts = {
         "tests": str(len(run.rollouts)),
-        "failures": "0",
+        "failures": str(sum(bool(outcomes_of(r)) for r in run.rollouts if r.ok) if outcomes_fail else 0),
         "errors": str(len(failed)),
         "skipped": "0",
         "time": f"{sum(r.wall_s or 0.0 for r in run.rollouts):.3f}",
@@ -163,17 +172,21 @@ def junit(run: Run) -> ET.Element:
     _properties(suite, {k: str(v) for k, v in facts.items() if v})
     with_values = len(run.rollouts) <= MAX_WITH_VALUES
     for rollout in run.rollouts:
-        _case(suite, rollout, with_values)
+        _case(suite, rollout, with_values, outcomes_fail)
     return root
 
 
-def _case(suite: ET.Element, rollout: Rollout, with_values: bool) -> None:
+def _case(suite: ET.Element, rollout: Rollout, with_values: bool, outcomes_fail: bool) -> None:
     name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
     case = ET.SubElement(
         suite, "testcase", {"classname": clean(rollout.scene), "name": clean(name), "time": f"{rollout.wall_s or 0.0:.3f}"}
     )
     values = {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()} if rollout.ok and with_values else {}
-    _properties(case, {"path": rollout.path, **values} if rollout.path else values)
+    had = outcomes_of(rollout) if rollout.ok else frozenset()
+    facts = ({"path": rollout.path} if rollout.path else {}) | ({"outcome": in_words(had)} if rollout.ok else {})
+    _properties(case, facts | values)
+    if had and outcomes_fail:
+        ET.SubElement(case, "failure", {"type": told(had)[0].name, "message": clean(in_words(had))}).text = clean(in_words(had))
     if not rollout.ok:
         first = next((line for line in rollout.failure.splitlines() if line.strip()), "no message was recorded")
         error = ET.SubElement(case, "error", {"type": clean(rollout.failure_class or "unknown"), "message": clean(first)})
@@ -241,9 +254,9 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     """Build one suite of checks in front of the run's own suite of rollouts.
 
     A check that is worse or over its limit is a failure of type ``regression``, one that is not decided a failure of type ``undecided``, or
-    skipped where it does not bind.
+    skipped where it does not bind. How the drives ended is said of them and fails nothing here: the gate's checks are the verdict.
     """
-    root = junit(run)
+    root = junit(run, outcomes_fail=False)
     suite = ET.Element("testsuite", {"name": clean(f"gate {gate}")})
     n_failures = n_skipped = 0
     for check in verdict.checks:

@@ -1,4 +1,4 @@
-"""Renderers side by side: strips of one cell at the same times, and the cells whose outcome differs from the baseline's."""
+"""Arms side by side: strips of one cell at the same times, and the cells whose outcome differs from the baseline's."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.io.reading.images import decode_image
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import cell_name
+from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.numbers import Cell, fixed, missing, short
+from evaluators.statistics.arms import Arm, Base, axis_bases
 
 MAX_WIDTH = 1600  # pixels of an inlined strip
 MAX_BYTES = 90_000  # above this a strip is encoded again
@@ -25,9 +28,15 @@ MAX_BYTES = 90_000  # above this a strip is encoded again
 
 @dataclass(frozen=True)
 class Strip:
-    """One renderer's frames."""
+    """One arm's frames.
 
-    renderer: str
+    Attributes:
+        name: The renderer, or the policy where a run has one renderer.
+        colour: Number of its colour.
+    """
+
+    name: str
+    colour: int
     src: str  # data: address
     width: int
     height: int
@@ -37,14 +46,14 @@ class Strip:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Strips of one scene, policy and seed."""
+    """Strips of one scene and seed, and of one policy or one renderer."""
 
     scene: str
-    policy: str
+    of: str
     seed: int
     times: tuple[str, ...]
     strips: tuple[Strip, ...]
-    absent: tuple[str, ...]  # renderers without a strip in this cell
+    absent: tuple[str, ...]  # arms without a strip in this cell
     differing_times: bool
 
     @property
@@ -53,10 +62,18 @@ class Comparison:
         return sum(len(s.src) for s in self.strips)
 
 
+def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
+    """Return (renderer, policy) -> (colour, dash): a colour for each renderer, or for each policy where there is one renderer."""
+    if len(run.renderers) == 1:
+        return {(run.renderers[0], policy): (i, 0) for i, policy in enumerate(run.policies)}
+    return {(renderer, policy): (i, j) for i, renderer in enumerate(run.renderers) for j, policy in enumerate(run.policies)}
+
+
 def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) -> tuple[list[Comparison], list[str]]:
-    """Pick one cell per scene, the one that most renderers finished, and inline its strips.
+    """Pick one cell per scene, the one that most arms finished, and inline its strips.
 
     Args:
+        run: The run; renderers stand side by side, or policies where there is one renderer.
         scenes: Candidate scenes, the most telling first.
         limit: Most scenes to inline.
         budget_bytes: Most bytes of pictures to inline; the first scene is always shown.
@@ -67,11 +84,12 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
     shown: list[Comparison] = []
     left_out: list[str] = []
     spent = 0
+    by_policy = len(run.renderers) == 1
     for scene in scenes:
         cells: dict[tuple[str, int], list[Rollout]] = {}
         for rollout in run.by_scene.get(scene, ()):
             if run.file_of(rollout, "strip.jpg") is not None:
-                cells.setdefault((rollout.policy, rollout.seed), []).append(rollout)
+                cells.setdefault(("" if by_policy else rollout.policy, rollout.seed), []).append(rollout)
         if not cells:
             continue
         (policy, seed), members = max(cells.items(), key=lambda item: len(item[1]))  # the first of equals
@@ -90,23 +108,27 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
 
 
 def _comparison(run: Run, scene: str, policy: str, seed: int, members: list[Rollout]) -> Comparison | None:
-    by_renderer = {r.renderer: r for r in members}
+    by_policy = len(run.renderers) == 1
+    by_name = {r.policy if by_policy else r.renderer: r for r in members}
+    colours, names = colours_of(run), run.policies if by_policy else run.renderers
     strips, absent, times = [], [], []
-    for renderer in run.renderers:
-        rollout = by_renderer.get(renderer)
+    for name in names:
+        rollout = by_name.get(name)
         path = run.file_of(rollout, "strip.jpg") if rollout else None
         encoded = inline_jpeg(path) if path else None
         if rollout is None or encoded is None:
-            absent.append(renderer)
+            absent.append(name)
             continue
-        strips.append(Strip(renderer, *encoded, run.href(rollout, "front.mp4"), run.href(rollout)))
+        colour = colours[rollout.renderer, rollout.policy][0]
+        strips.append(Strip(name, colour, *encoded, run.href(rollout, "front.mp4"), run.href(rollout)))
         times.append(tuple(int(t) for t in run.manifest(rollout).get("strip_t_us") or ()))
     if not strips:
         return None
     differing = len(set(times)) > 1
     zero = int((run.scene_data(scene) or {}).get("start_us") or 0)
     printed = () if differing else tuple(f"t = {fixed((t - zero) * 1e-6, 1)}\u00a0s" for t in times[0])
-    return Comparison(scene, policy, seed, printed, tuple(strips), tuple(absent), differing)
+    where = policy or (run.renderers[0] if len(run.policies) > 1 else run.policies[0])
+    return Comparison(scene, where, seed, printed, tuple(strips), tuple(absent), differing)
 
 
 def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
@@ -128,20 +150,16 @@ def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
 
 
 FLIPS_NAME = "flips.json"
-OUTCOMES = {  # metric -> word, most severe first
-    "collision_at_fault": "at-fault collision",
-    "collision_any": "collision",
-    "offroad": "off-road",
-}
 MAX_FLIP_ROWS = 400
+FlipKey = tuple[str, str, str, int, str]  # renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
 
 
 @dataclass(frozen=True)
 class Flip:
-    """One scene, policy and seed with two outcomes.
+    """One scene and seed that end differently in two arms.
 
     Attributes:
-        base, other: The rollouts behind the baseline and behind the other renderer.
+        base, other: The rollouts of the baseline and of the other arm.
         was, now: Their outcomes in words.
         tone: "worse" where an event came and none went, "better" where one went and none came, else "mixed".
     """
@@ -153,32 +171,54 @@ class Flip:
     tone: str
 
     @property
-    def key(self) -> tuple[str, str, str, int]:
-        """Give renderer, policy, scene and seed of the other side."""
-        return self.other.cell
+    def key(self) -> FlipKey:
+        """Give what names it among the flips of a run."""
+        return (*self.other.cell, self.base.variant)
+
+    @property
+    def sides(self) -> tuple[str, str]:
+        """Give what the two sides are called: by their renderers, their policies, or both."""
+        one, two = self.base, self.other
+        if one.policy == two.policy:
+            return one.renderer, two.renderer
+        return (one.policy, two.policy) if one.renderer == two.renderer else (one.variant, two.variant)
 
 
 def find_flips(run: Run) -> tuple[list[Flip], int]:
-    """Find every flip of a run.
+    """Find every flip of a run: between renderers with the same policy, and between policies behind the same renderer.
 
     Returns:
         The flips, worse ones first and then as in ``rollouts.parquet``, and the number of pairs compared.
     """
-    base = baseline_of(run)
-    partners = {r.cell[1:]: r for r in run.rollouts if r.renderer == base and r.ok}
+    bases = flip_bases(run)
+    known: dict[tuple[str, str, str, int], Rollout] = {}
+    for rollout in run.rollouts:
+        if has_ended(rollout):
+            known.setdefault(rollout.cell, rollout)
     flips: list[Flip] = []
     compared = 0
     for rollout in run.rollouts:
-        partner = partners.get(rollout.cell[1:])
-        if rollout.renderer == base or not rollout.ok or partner is None:
-            continue
-        compared += 1
-        was, now = events(partner), events(rollout)
-        if was != now:
-            tone = "worse" if was < now else "better" if now < was else "mixed"
-            flips.append(Flip(partner, rollout, in_words(was), in_words(now), tone))
+        for base in bases if has_ended(rollout) else ():
+            arm = Arm(rollout.renderer, rollout.policy)
+            other = base.of(arm)
+            partner = known.get((other.renderer, other.policy, rollout.scene, rollout.seed))
+            if other == arm or partner is None or not (rollout.ok or partner.ok):
+                continue
+            compared += 1
+            was, now = outcomes_of(partner), outcomes_of(rollout)
+            if was != now:
+                tone = "worse" if was < now else "better" if now < was else "mixed"
+                flips.append(Flip(partner, rollout, in_words(was), in_words(now), tone))
     order = {"worse": 0, "mixed": 1, "better": 2}
     return sorted(flips, key=lambda flip: order[flip.tone]), compared
+
+
+def flip_bases(run: Run) -> list[Base]:
+    """Return what outcomes are compared with: the baseline's renderer, and its policy where there are several."""
+    named = (run.info.get("config") or {}).get("baseline")
+    _, by_policy = axis_bases([Arm(r, policy) for r in run.renderers for policy in run.policies], named)
+    found = [Base(renderer=baseline_of(run))] if len(run.renderers) > 1 else []
+    return [*found, *([by_policy] if by_policy else [])]
 
 
 def baseline_of(run: Run) -> str | None:
@@ -190,17 +230,6 @@ def baseline_of(run: Run) -> str | None:
     return next(iter(run.renderers), None)
 
 
-def events(rollout: Rollout) -> frozenset[str]:
-    """Return which of the `OUTCOMES` a rollout had."""
-    return frozenset(name for name in OUTCOMES if rollout.flag(name))
-
-
-def in_words(had: frozenset[str]) -> str:
-    """Name an outcome."""
-    said = [word for name, word in OUTCOMES.items() if name in had and not (name == "collision_any" and "collision_at_fault" in had)]
-    return " and ".join(said) or "no event"
-
-
 @dataclass(frozen=True)
 class FlipRow:
     """One flip as the report shows it.
@@ -208,9 +237,9 @@ class FlipRow:
     Attributes:
         time: When the plans diverged, since the first frame.
         gap: How far apart they were then.
-        pictures: (renderer, variant, data address, width, height) at that time.
+        pictures: (side, colour, data address, width, height) at that time.
         why_not: Why there are no pictures.
-        links: (renderer, variant, clip, folder).
+        links: (side, colour, clip, folder).
     """
 
     flip: Flip
@@ -234,9 +263,9 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     """
     flips, compared = find_flips(run)
     path = run.folder / FLIPS_NAME
-    told: dict[tuple[str, str, str, int], Mapping[str, Any]] = {}
+    told: dict[FlipKey, Mapping[str, Any]] = {}
     if path.is_file():
-        told = {(c["renderer"], c["policy"], c["scene"], c["seed"]): c for c in read_json(path).get("cells") or []}
+        told = {key_of_entry(c): c for c in read_json(path).get("cells") or []}
     spent, rows = 0, []
     for flip in flips[:MAX_FLIP_ROWS]:
         entry = told.get(flip.key)
@@ -246,10 +275,16 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     return rows, len(flips) - len(rows), compared
 
 
+def key_of_entry(entry: Mapping[str, Any]) -> FlipKey:
+    """Return the key of an entry of ``flips.json``."""
+    against = entry.get("against") or cell_name(str(entry["baseline"]), str(entry["policy"]))  # earlier files name the renderer alone
+    return (entry["renderer"], entry["policy"], entry["scene"], entry["seed"], str(against))
+
+
 def _row(run: Run, flip: Flip, entry: Mapping[str, Any] | None, room: bool) -> FlipRow:
-    index = {name: i for i, name in enumerate(run.renderers)}
-    sides = (flip.base, flip.other)
-    links = tuple((r.renderer, index[r.renderer], run.href(r, "front.mp4"), run.href(r)) for r in sides)
+    colours = colours_of(run)
+    sides = tuple((name, r, colours[r.renderer, r.policy][0]) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True))
+    links = tuple((name, colour, run.href(r, "front.mp4"), run.href(r)) for name, r, colour in sides)
     if entry is None:
         looked = (run.folder / FLIPS_NAME).is_file()
         why = "not looked for: there are too many flips" if looked else "the run folder has no logs to look for it in"
@@ -260,12 +295,12 @@ def _row(run: Run, flip: Flip, entry: Mapping[str, Any] | None, room: bool) -> F
     seconds = float(entry["after_us"]) * 1e-6
     time, gap = Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds), Cell(short(float(entry["gap_m"]), "m"), sort=float(entry["gap_m"]))
     pictures = []
-    for rollout in sides if room else ():
-        name = (entry.get("frames") or {}).get(rollout.renderer)
+    for side, _, colour in sides if room else ():
+        name = (entry.get("frames") or {}).get(side)
         file = run.folder / name if name else None
         inside = file is not None and file.is_file() and file.resolve().is_relative_to(run.folder.resolve())
         encoded = inline_jpeg(file) if file is not None and inside else None
         if encoded is not None:
-            pictures.append((rollout.renderer, index[rollout.renderer], *encoded))
+            pictures.append((side, colour, *encoded))
     why = "" if pictures else str(entry.get("frames_reason") or "left out to keep this file small; they are in flips/")
     return FlipRow(flip, time, gap, str(entry.get("source") or ""), tuple(pictures), why, links)

@@ -15,34 +15,64 @@ from evaluators.opening import Run
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
 from evaluators.report.provenance import certificate_caution
+from evaluators.statistics.outcomes import outcome_table, sentence
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
+LEADING = 4  # arms named in the headline
 FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
 
 
 @dataclass(frozen=True)
 class Point:
-    """What was found for one renderer."""
+    """What was found for one arm.
+
+    Attributes:
+        name: What sentences call it.
+        tone: Of its differences.
+        text: What they are.
+        worse, better: Metrics that are.
+        baseline: What it is compared with; empty where with nothing.
+        lead: The one difference that says most, with its interval.
+        variant: Its key in ``summary.json``.
+    """
 
     name: str
     tone: Tone
     text: str
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
-    baseline: str = ""  # what it is compared with; empty where with nothing
-    lead: str = ""  # the one difference that says most, with its interval
+    baseline: str = ""
+    lead: str = ""
+    variant: str = ""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The head of a report: a title, one point per renderer, and caveats."""
+    """The head of a report: how the drives ended, what differs between arms, one point per comparison, and caveats.
+
+    Attributes:
+        title: The differences; of one arm alone how its drives ended.
+        tone: Of the differences.
+        points: What was compared.
+        cautions: What a reader must know.
+        outcomes: Arm, as it is called in the run, and how its drives ended.
+    """
 
     title: str
     tone: Tone
     points: tuple[Point, ...] = ()
     cautions: tuple[str, ...] = ()
+    outcomes: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def head(self) -> str:
+        """Give how the drives of all arms ended, in one sentence; the differences where there are none."""
+        if len(self.outcomes) < 2:
+            return self.title
+        shown = "; ".join(f"{name}: {text}" for name, text in self.outcomes[:LEADING])
+        return shown + (f"; and {len(self.outcomes) - LEADING} more" if len(self.outcomes) > LEADING else "")
 
     def name_of(self, point: Point) -> str:
         """Name a point; with what it is compared where not all are with the same."""
@@ -55,24 +85,33 @@ def find(run: Run) -> Finding:
     done = sum(r.ok for r in run.rollouts)
     if not run.rollouts:
         return Finding("Nothing was run: the run folder holds no rollouts", "broken")
+    ended = endings(run)
     if done == 0:
-        return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run))
-    paired = pair_tables(run.summary)
-    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired)
+        return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run), ended)
+    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in pair_tables(run.summary))
     if points:
         title = "; ".join(_clause(run, point) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
         tones = {point.tone for point in points}
         order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
         tone = next(t for t in order if t in tones)
-        return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, _cautions(run))
-    alone = tuple(Point(variant, "neutral", _alone(run, variant)) for variant in run.variants)
-    title = (
-        f"{alone[0].name} \u2013 {alone[0].text}"
-        if len(alone) == 1
-        else f"{plural(len(alone), 'renderer')} driven, none compared with another"
-    )
-    return Finding(title, "neutral", alone if len(alone) > 1 else (), _cautions(run))
+        return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, _cautions(run), ended)
+    title = f"{ended[0][0]}: {ended[0][1]}" if len(ended) == 1 else f"{plural(len(ended), 'arm')} driven, none of which can be paired"
+    alone = tuple(Point(arm_label(run, name), "neutral", _alone(run, name), variant=name) for name in run.variants)
+    return Finding(title, "neutral", alone, _cautions(run), ended)
+
+
+def endings(run: Run) -> tuple[tuple[str, str], ...]:
+    """Return each arm, as it is called in the run, and how its drives ended; without times in runs of earlier versions."""
+    table = run.summary.get("outcomes") or outcome_table(run.rollouts)
+    return tuple((arm_label(run, name), sentence(entry)) for name, entry in table.items())
+
+
+def arm_label(run: Run, name: str) -> str:
+    """Return what sentences call an arm: its policy where a run has one renderer, its renderer where it has one policy, else both."""
+    if len(run.renderers) == 1 and len(run.policies) > 1:
+        return name.removeprefix(f"{run.renderers[0]}/")
+    return name.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else name
 
 
 def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
@@ -133,7 +172,7 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     moved = [*said, *(m for m in lead if m not in said and m != "progress" and finite(pairs[m].get("diff")) != 0.0)]
     same = [m for m in lead if m not in moved and m != "progress"]
     parts = [_difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
-    parts += [f"no difference at all in {_listing(run, same)}"] if same else []
+    parts += [_nothing_seen(run, variant, m, pairs[m]) for m in same]
     text = "; ".join(parts)
     text = text or "no metric is valid in both members of any pair"
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
@@ -146,7 +185,22 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     shown = [m for m in lead if pairs[m].get("difference") in ("better", "worse")]
     most = next(iter(shown), max(lead, key=against_margin, default=None))
     first = "" if most is None else _difference(run, variant, most, pairs[most], brief=False)
-    return Point(variant, tone, text, worse, better, baseline, first)
+    return Point(arm_label(run, variant), tone, text, worse, better, arm_label(run, baseline), first, variant)
+
+
+def _nothing_seen(run: Run, variant: str, metric: str, entry: Mapping[str, Any]) -> str:
+    """Say what a difference of zero excludes, and what not."""
+    facts, level = run.table.shown(metric), _level(run, variant, metric)
+    bounds = interval(entry.get("ci95"), 0.0)
+    if bounds is None:
+        return f"{facts.words}: {level} in both; one scene excludes no difference"
+    scale, unit = (100.0, "points") if facts.in_percent else (1.0, str(entry.get("unit") or ""))
+    low, high = -bounds[0] * scale, bounds[1] * scale
+    places = 1 if scale == 100.0 else decimals(low, high, digits=3)
+    ends = fixed(high, places) if fixed(high, places) == fixed(low, places) else f"+{fixed(high, places)} or \u2212{fixed(low, places)}"
+    return f"{facts.words}: {level} in both; a difference beyond {ends}\u00a0{unit} is excluded, a smaller one is not".replace(
+        "\u00a0 ", " "
+    )
 
 
 def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:

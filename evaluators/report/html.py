@@ -18,17 +18,18 @@ from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Series
 from alpasim_plugin.run_folder.schema import AGAIN, DOING
+from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.flips import baseline_of, comparisons, flip_rows
+from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
-from evaluators.report.rollouts import COLLISION, read_series, rollout_block
+from evaluators.report.rollouts import read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 
@@ -40,15 +41,15 @@ LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
-NO_REPLAYS: Mapping[tuple[str, str, str, int], str] = {}
+NO_REPLAYS: Mapping[FlipKey, str] = {}
 
 
-def write_report(run_dir: Path | str, replays: Mapping[tuple[str, str, str, int], str] = NO_REPLAYS) -> Path:
+def write_report(run_dir: Path | str, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> Path:
     """Write ``report.html`` into a run folder.
 
     Args:
         run_dir: A run folder (docs/architecture.md). Nothing else is read.
-        replays: Renderer, policy, scene and seed of a changed outcome -> where it is replayed, relative to the run folder.
+        replays: Key of a changed outcome -> where it is replayed, relative to the run folder.
 
     Returns:
         Path of the report.
@@ -64,7 +65,7 @@ def write_report(run_dir: Path | str, replays: Mapping[tuple[str, str, str, int]
     return path
 
 
-def render_report(run: Run, replays: Mapping[tuple[str, str, str, int], str] = NO_REPLAYS) -> str:
+def render_report(run: Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> str:
     """Render the report as a string; ``replays`` as in `write_report`."""
     return render_page("report.html.j2", ("theme", "report"), ("theme", "report", "rollouts"), dash=DASH, replays=replays, **context(run))
 
@@ -91,7 +92,7 @@ def context(run: Run) -> dict[str, Any]:
     sample = sampled_scenes(run)
     series = read_series(run, sample)
     interesting = by_interest(run)
-    variant_of = {(r, p): (i, j) for i, r in enumerate(run.renderers) for j, p in enumerate(run.policies)}
+    variant_of = colours_of(run)
     looked_at = None if sample is None else interesting[: 2 * MAX_SCENE_PLOTS]
     views, no_view = scene_views(run, series if looked_at is None else read_series(run, looked_at), looked_at or interesting, variant_of)
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
@@ -100,11 +101,11 @@ def context(run: Run) -> dict[str, Any]:
     by_scene, more_scene_rows = scene_rows(run, interesting)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
-    place = {name: i for i, name in enumerate(run.renderers)}
-    colours = {}  # every column has its renderer's colour
+    colours = {}  # every column has the colour of its renderer, or of its policy where there is one renderer
     for i, variant in enumerate(run.variants):
-        renderer = next((r.renderer for r in run.rollouts_of(variant)), variant)
-        colours[variant] = place.get(renderer, i)
+        first = next(iter(run.rollouts_of(variant)), None)
+        colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
+    by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
     split = strata(run, sample)
     of_sample = "" if sample is None else f"From {plural(len(sample), 'scene')} of {len(run.scenes)}, evenly chosen from their list."
@@ -121,7 +122,8 @@ def context(run: Run) -> dict[str, Any]:
         "flips": flips,
         "more_flips": more_flips,
         "flip_pairs": flip_pairs,
-        "baseline": baseline_of(run),
+        "baseline": " or ".join(base.name for base in flip_bases(run)),
+        "baselines": [base.name for base in flip_bases(run)],
         "strata": [(one, stratum_rows(one), strata_chart(one)) for one in split],
         "strata_heads": heads(),
         "speed_charts": speed_against_error(run, colours),
@@ -131,7 +133,8 @@ def context(run: Run) -> dict[str, Any]:
         "other_rows": [row for row in rows if row not in headline],
         "headline_pairs": [p for p in pairs if p.metric in {row.name for row in headline}] or pairs,
         "other_pairs": [p for p in pairs if headline and p.metric not in {row.name for row in headline}],
-        "renderers": run.renderers,
+        "coloured": run.policies if by_policy else run.renderers,
+        "dashed": len(run.policies) > 1 and not by_policy,
         "policies": run.policies,
         "charts": drift_charts(run.rollouts, series, variant_of),
         "views": views,
@@ -169,7 +172,7 @@ def by_interest(run: Run) -> list[str]:
 
     def interest(scene: str) -> tuple[int, float]:
         rollouts = run.by_scene.get(scene, ())
-        events = sum(r.flag(*COLLISION) + r.flag("offroad") if r.ok else 1 for r in rollouts)
+        events = sum(len(outcomes_of(r)) if has_ended(r) else 1 for r in rollouts)
         far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
         return events, max(far, default=0.0)
 

@@ -1,4 +1,4 @@
-"""Each rollout of a run: when and where it collided or left the road, and all of them as columns inside the page.
+"""Each rollout of a run: when and where its outcomes began, and all of them as columns inside the page.
 
 The browser draws the table row by row as it is scrolled, so it may have any length. The page holds one block: a header in JSON, then the
 columns as bytes, compressed together. 100,000 rollouts with 25 metrics take some seven megabytes; a row of HTML each would take a hundred.
@@ -13,7 +13,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -21,25 +21,28 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.run_folder.rows import Own, Rollout, Series, series_by_cell
+from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, has_ended, in_words, outcomes_of, told
 from evaluators.opening import Run
 
 COLLISION = ("collision_any", "collision_at_fault", "collision_front", "collision_lateral", "collision_rear")
 SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}
-SERIES = (*COLLISION, "offroad", "eval_relevant", "ego_x_m", "ego_y_m", "ego_yaw_rad", "lateral_bias_m")
+OTHERS = tuple(name for name in OUTCOMES if name != POLICY_FAULT and not name.startswith("collision"))
+SERIES = (*COLLISION, *OTHERS, "eval_relevant", "ego_x_m", "ego_y_m", "ego_yaw_rad", "lateral_bias_m")
 
 
 @dataclass(frozen=True)
 class Event:
-    """The first collision or the first departure from the road of one rollout.
+    """The first time of an outcome of one rollout.
 
     Attributes:
+        kind: "collision", or the name of an outcome that touches nothing.
         t_s: Seconds since the rollout's first step; None where no step shows the event that the rollout's metric counts.
         t_us: The same instant on the rollout's own clock; None with ``t_s``.
         x_m, y_m, yaw_rad: Pose of the ego's rear axle at that time, world; None with ``t_s`` or where poses are not logged.
         side: Which part of the ego was touched, or "".
     """
 
-    kind: Literal["collision", "offroad"]
+    kind: str
     rollout: Rollout
     t_s: float | None = None
     x_m: float | None = None
@@ -51,8 +54,8 @@ class Event:
     @property
     def what(self) -> str:
         """Name the event."""
-        if self.kind == "offroad":
-            return "off-road"
+        if self.kind != "collision":
+            return OUTCOMES[self.kind].words
         return f"collision ({self.side})" if self.side else "collision"
 
 
@@ -80,12 +83,11 @@ def events_of(rollout: Rollout, series: Series) -> list[Event]:
     found = []
     if rollout.flag(*COLLISION):
         found.append(_event("collision", rollout, own, [m for m in COLLISION if rollout.flag(m)]))
-    if rollout.flag("offroad"):
-        found.append(_event("offroad", rollout, own, ["offroad"]))
-    return found
+    shown = {one.name for one in told(outcomes_of(rollout))}
+    return [*found, *(_event(name, rollout, own, [name]) for name in OTHERS if name in shown)]
 
 
-def _event(kind: Literal["collision", "offroad"], rollout: Rollout, own: Own, metrics: list[str]) -> Event:
+def _event(kind: str, rollout: Rollout, own: Own, metrics: list[str]) -> Event:
     firsts = {m: t for m in metrics if (t := _first(own, m)) is not None}
     side = next((SIDES[m] for m in metrics if m in SIDES), "")
     if not firsts:
@@ -117,7 +119,7 @@ def _at(own: Own, name: str, t_us: int) -> float | None:
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a failure's message
 KEPT_BITS = 13  # of a number's mantissa
-COLLIDED, LEFT_ROAD, FAILED, HAS_FOLDER, HAS_CLIP = (1 << bit for bit in range(5))
+COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP = (1 << bit for bit in range(5))
 CLIP = "front.mp4"
 
 
@@ -161,6 +163,7 @@ def rollout_block(run: Run) -> RolloutBlock:
         "seed": (str(r.seed) for r in rollouts),
         "folder": (quote(parent) for parent, _ in parents),
         "leaf": (quote(leaf) for _, leaf in parents),
+        "outcome": (in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts),
         "failure": ((f"{r.failure_class or 'unknown cause'}: {r.failure}"[:MAX_TEXT] if not r.ok else "") for r in rollouts),
     }
     for name, column in texts.items():
@@ -200,7 +203,8 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
     for rollout, (parent, leaf) in zip(run.rollouts, parents, strict=False):
         state = 0 if rollout.ok else FAILED
         if rollout.ok:
-            state |= (COLLIDED if rollout.flag(*COLLISION) else 0) | (LEFT_ROAD if rollout.flag("offroad") else 0)
+            had = outcomes_of(rollout)
+            state |= COLLIDED if rollout.flag(*COLLISION) else OTHERWISE if had else 0
         if parent not in names:
             names[parent] = frozenset()
             path = run.folder / parent

@@ -11,6 +11,7 @@ import numpy as np
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run
 from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
@@ -277,7 +278,7 @@ class Chip:
     """One rollout in the scene table: its seed and how it ended."""
 
     text: str
-    state: str  # ok | collision | offroad | failed
+    state: str  # ok | collision | offroad (and whatever else touches nothing) | failed
     title: str
     folder: str | None
     clip: str | None
@@ -325,18 +326,25 @@ def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow
 
 
 def _chip(run: Run, rollout: Rollout) -> Chip:
-    if not rollout.ok:
+    had = told(outcomes_of(rollout))
+    if had:
+        letters = "".join(dict.fromkeys(one.letter for one in had))
+        state, letter, said = _state(had[0].name), f" {letters}", in_words(one.name for one in had)
+    elif not rollout.ok:
         state, letter, said = "failed", " F", f"failed ({rollout.failure_class or 'unknown cause'})"
-    elif rollout.flag(*COLLISION):
-        state, letter, said = "collision", " C", "collision" + (" and off-road" if rollout.flag("offroad") else "")
-    elif rollout.flag("offroad"):
-        state, letter, said = "offroad", " O", "off-road"
     else:
-        state, letter, said = "ok", "", "no collision, not off-road"
+        state, letter, said = "ok", "", "no event"
     facts = [f"seed {rollout.seed}: {said}"]
     facts += [f"{rollout.frames} frames"] if rollout.frames is not None else []
     facts += [duration(rollout.wall_s)] if rollout.wall_s is not None else []
     return Chip(f"{rollout.seed}{letter}", state, ", ".join(facts), run.href(rollout), run.href(rollout, "front.mp4"))
+
+
+def _state(outcome: str) -> str:
+    """Return how a chip with an outcome is drawn."""
+    if outcome == POLICY_FAULT:
+        return "failed"
+    return "collision" if outcome.startswith("collision") else "offroad"
 
 
 def _count(done: list[Rollout], names: tuple[str, ...]) -> Cell:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -12,12 +12,14 @@ from rich.text import Text
 
 from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run
-from evaluators.report.flips import find_flips
+from evaluators.report.flips import find_flips, flip_bases
 from evaluators.report.headline import Finding, find
 from evaluators.report.numbers import Cell, finite, fixed, plural
 from evaluators.report.tables import metric_rows
+from evaluators.statistics.arms import Arm
 
 MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 %, scenes as clusters"
 GAP_NOTE = "; \u2014: one rollout or one scene is too few, or no valid value (report.html says which)"
@@ -64,7 +66,9 @@ def _cell(cell: Cell) -> Text:
 
 
 LABEL = 9  # width of the labels
+MOST_ARMS = 12  # named at the end of a run
 MORE_SCENES = "suites/urban"
+FORK_AT_S = 1.0  # seconds of the drive that a suggested fork keeps
 SEEING = "lane-camera"  # a shipped policy with a camera
 
 
@@ -75,7 +79,11 @@ def ending_lines(run: Run) -> list[str]:
         run: A finished run.
     """
     finding = find(run)
-    lines = [labelled("verdict", finding.title)]
+    several = len(finding.outcomes) > 1
+    lines = [labelled("" if i else "outcome", f"{name}: {text}") for i, (name, text) in enumerate(finding.outcomes[:MOST_ARMS])]
+    if len(finding.outcomes) > MOST_ARMS:
+        lines.append(labelled("", f"and {len(finding.outcomes) - MOST_ARMS} more arms: report.html"))
+    lines += [labelled("verdict", finding.title)] if several or not lines else []
     lines += [labelled("", f"{finding.name_of(point)}: {point.lead}") for point in finding.points if point.lead]
     cost = cost_text(run.summary)
     return [*lines, *([labelled("cost", cost)] if cost else [])]
@@ -107,35 +115,52 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
     if failed:
         return ["simrun", "check", str(run.folder)], "says what is damaged or missing; the same command runs it again"
     if all(r.frames == 0 for r in run.rollouts):
-        names = ",".join(run.renderers if len(run.renderers) > 1 else [*run.renderers, _other(run)])
+        names = run.renderers if len(run.renderers) > 1 else [*run.renderers, _other(run)]
         why = "a policy that looks: without a camera it drives alike behind every renderer"
         return _again(run, names, run.scenes_asked or [MORE_SCENES], SEEING), why
-    if not finding.points:
+    if not finding.points or len(run.renderers) * len(run.policies) == 1:
         more = _other(run)
-        names = ",".join([*run.renderers, more])
-        return _again(run, names, run.scenes_asked or [MORE_SCENES]), f"compares with {more}, pair by pair"
+        return _again(run, [*run.renderers, more], run.scenes_asked or [MORE_SCENES]), f"compares with {more}, pair by pair"
     flips, _ = find_flips(run)
     if flips:
-        return _probe(run, flips[0].other, flips[0].base.renderer), "the same poses behind both: where the plans part"
+        return _of_pair(run, flips[0].base, flips[0].other)
     if finding.tone == "unclear":
-        return _again(run, ",".join(run.renderers), [MORE_SCENES]), "more scenes: the interval is too wide to decide"
-    mine = [r for r in run.rollouts if r.renderer == finding.points[0].name]
-    worst = max(mine, key=lambda r: r.metrics.get("lateral_distance_m") or 0.0, default=run.rollouts[0])
-    return _probe(run, worst, finding.points[0].baseline), "the same poses behind both renderers: how far the plans differ, frame by frame"
+        return _again(run, run.renderers, [MORE_SCENES]), "more scenes: the interval is too wide to decide"
+    point = finding.points[0]
+    worst = max(run.rollouts_of(point.variant), key=lambda r: r.metrics.get("lateral_distance_m") or 0.0, default=run.rollouts[0])
+    arm = Arm(worst.renderer, worst.policy)
+    bases = (base.of(arm) for base in flip_bases(run))
+    other = next((base for base in bases if base != arm), arm)
+    partners = (
+        r for r in run.rollouts if (r.renderer, r.policy, r.scene, r.seed) == (other.renderer, other.policy, worst.scene, worst.seed)
+    )
+    return _of_pair(run, next(partners, worst), worst)
 
 
-def _probe(run: Run, rollout: Rollout, baseline: str) -> list[str]:
-    cell = f"{rollout.renderer}/{rollout.policy}/{rollout.scene}/{rollout.seed}"
-    return ["simrun", "probe", str(run.folder), "--cell", cell, "--renderers", ",".join(dict.fromkeys([baseline, rollout.renderer]))]
+def _of_pair(run: Run, base: Rollout, other: Rollout) -> tuple[list[str], str]:
+    """Return what shows why two drives differ: a probe of two renderers; of two policies a fork of the first drive to the second policy."""
+    if base.renderer != other.renderer:
+        names = ",".join(dict.fromkeys([base.renderer, other.renderer]))
+        words = ["simrun", "probe", str(run.folder), "--cell", _named(other), "--renderers", names]
+        return words, "the same poses behind both: where the plans part"
+    if base.policy != other.policy:
+        words = ["simrun", "fork", str(run.folder), "--cell", _named(other), "--at", f"{FORK_AT_S:g}", "--policy", base.policy]
+        return words, f"from the same instant on: what {base.policy} does where {other.policy} was"
+    return ["simrun", "view", str(run.folder)], "replays the drives in a browser"
+
+
+def _named(rollout: Rollout) -> str:
+    return cell_name(*rollout.cell)
 
 
 def _other(run: Run) -> str:
-    return "3dgs" if "3dgs" not in run.renderers else "onefixer"
+    return "3dgs" if "3dgs" not in run.renderers else "onefixer" if "onefixer" not in run.renderers else "clean"
 
 
-def _again(run: Run, renderers: str, scenes: list[str], policy: str = "") -> list[str]:
+def _again(run: Run, renderers: Sequence[str], scenes: list[str], policy: str = "") -> list[str]:
     seeds = max(1, len(run.info.get("seeds") or ()))
-    return ["simrun", "--renderer", renderers, "--policy", policy or ",".join(run.policies), "--seeds", str(seeds), *scenes]
+    drivers = policy or ",".join(run.policies)
+    return ["simrun", "--renderer", ",".join(dict.fromkeys(renderers)), "--policy", drivers, "--seeds", str(seeds), *scenes]
 
 
 def labelled(label: str, text: str) -> str:

@@ -11,8 +11,10 @@ from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run
+from evaluators.statistics.arms import arms_of, axis_bases, base_named, choices
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
 from evaluators.statistics.paired import LISTED, compare
+from evaluators.statistics.summary import paired_arms
 
 DOING = "comparing runs"
 
@@ -26,6 +28,7 @@ class Comparison:
             several policies.
         with_base: The same of renderers with a fixer against the renderer below it, where that is not the baseline.
         metrics: What the metrics are.
+        arms: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty where one arm is the baseline of all.
         notes: What a reader must know, such as policies that were paired although their names differ.
     """
 
@@ -33,33 +36,50 @@ class Comparison:
     notes: tuple[str, ...] = field(default=())
     with_base: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     metrics: MetricTable = field(default_factory=lambda: METRICS)
+    arms: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
 
 def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED) -> Comparison:
-    """Compare the renderers of one run with one of them, by default the run's own baseline or its first.
+    """Compare the arms of one run with one of them, by default with the run's own baseline, or with the first.
+
+    Args:
+        run: The run.
+        baseline: RENDERER, POLICY or RENDERER/POLICY; None: renderers with the run's own, and policies too where there are several.
+        margins, listed: As for `evaluators.statistics.paired.paired`.
 
     Raises:
-        InputError: Only one renderer, or an unknown baseline.
+        InputError: Only one arm, or an unknown baseline.
     """
     table = table_of_run(run)
-    known = table.renderers
-    name = baseline or (run.info.get("config") or {}).get("baseline") or (known[0] if known else "")
-    if name not in known:
-        raise InputError(DOING, f"baseline {name!r}", f"{run.folder} does not have it", f"choose one of {', '.join(known) or 'none'}")
-    if len(known) < 2:
-        raise InputError(DOING, str(run.folder), f"only one renderer, {name}", "name a second run, or run two renderers")
-    bases = {one: base for one, base in (run.info.get("bases") or {}).items() if one in known and base in known and name not in (one, base)}
-    found = _pairs(table, table, {other: name for other in known if other != name}, "", margins, run.table, listed)
-    with_base = {} if baseline is not None else _pairs(table, table, bases, "", margins, run.table, listed)
-    return Comparison(found, (), with_base, run.table)
+    arms = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
+    where, known = str(run.folder), table.renderers
+    base = None if baseline is None else base_named(baseline, arms, DOING, where)
+    if len(arms) < 2:
+        only = arms[0].name if arms else "none"
+        raise InputError(DOING, where, f"only one arm, {only}", "name a second run, or run two renderers or two policies")
+    if base is not None and base.policy is not None:
+        return Comparison(paired_arms(table, base.pairs(arms), run.table, margins=margins, listed=listed), metrics=run.table)
+    by_renderer, by_policy = axis_bases(arms, baseline or (run.info.get("config") or {}).get("baseline"))
+    if base is not None and by_renderer is None:
+        raise InputError(DOING, where, f"only one renderer, {known[0]}", f"choose one of {', '.join(choices(arms))}")
+    name = "" if by_renderer is None else by_renderer.renderer
+    bases = {one: below for one, below in (run.info.get("bases") or {}).items() if one in known and below in known}
+    partner = {other: str(name) for other in known if name and other != name}
+    below = {one: other for one, other in bases.items() if name not in (one, other)}
+    found = _pairs(table, table, partner, "", margins, run.table, listed)
+    with_base = {} if baseline is not None else _pairs(table, table, below, "", margins, run.table, listed)
+    between = [] if baseline is not None or by_policy is None else by_policy.pairs(arms)
+    of_policies = paired_arms(table, between, run.table, margins=margins, listed=listed)
+    return Comparison(found, (), with_base, run.table, of_policies)
 
 
 def compare_runs(
     first: Run, second: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED
 ) -> Comparison:
-    """Compare the second run with the first: each renderer with the same name, or all with ``baseline`` of the first run.
+    """Compare the second run with the first: each arm with the one of the same name, or all with ``baseline`` of the first run.
 
-    A policy is paired with the policy of the same name; where the runs share none and have one each, with the other's.
+    A policy is paired with the policy of the same name; where the runs share none and have one each, with the other's. A baseline is a
+    RENDERER, a POLICY or a RENDERER/POLICY of the first run.
 
     Raises:
         InputError: The runs differ in preset or in a scene's content, share no scene, a renderer or policy has no partner, or a metric is
@@ -73,15 +93,25 @@ def compare_runs(
     table, base = table_of_run(second), table_of_run(first)
     partner_of = {policy: policy for policy in table.policies if policy in base.policies}
     notes: tuple[str, ...] = ()
-    if not partner_of:
+    if not partner_of and not _names_policy(baseline, base):
         theirs, ours = base.policies, table.policies
         if len(theirs) != 1 or len(ours) != 1:
-            do = "compare runs of one policy each, or of the same policies"
+            do = "compare runs of one policy each or of the same policies, or name one with --baseline RENDERER/POLICY"
             raise InputError(DOING, f"policies {theirs} and {ours}", "none in common", do)
         partner_of, notes = {ours[0]: theirs[0]}, (f"policy {ours[0]} is compared with policy {theirs[0]}",)
     there, here = base.renderers, table.renderers
-    if baseline is not None and baseline not in there:
-        raise InputError(DOING, f"baseline {baseline!r}", f"{first.folder} does not have it", f"choose one of {', '.join(there)}")
+    notes += weights_note(first, second)
+    if baseline is not None:
+        theirs_arms = arms_of((r, policy) for policy in base.policies for r in base.sides(policy))
+        named = base_named(baseline, theirs_arms, DOING, str(first.folder))
+        if named.policy is not None:
+            mine = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
+            chosen_arms = [(arm, named.of(arm)) for arm in mine if named.of(arm) in theirs_arms]
+            if not chosen_arms:
+                raise InputError(DOING, f"baseline {baseline!r}", f"behind no renderer of {second.folder}", "name RENDERER/POLICY")
+            metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, DOING, both)
+            pairs = paired_arms(table, chosen_arms, metrics, base, margins, listed, f"{first.folder}: ")
+            return Comparison(pairs, weights_note(first, second), metrics=metrics)
     alone = there[0] if len(there) == 1 else None
     partner = {name: baseline or (name if name in there else alone) for name in here}
     lone = [name for name, other in partner.items() if other is None]
@@ -90,6 +120,19 @@ def compare_runs(
     chosen = {name: other for name, other in partner.items() if other is not None}
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, DOING, both)
     return Comparison(_pairs(table, base, chosen, f"{first.folder}: ", margins, metrics, listed, partner_of), notes, metrics=metrics)
+
+
+def weights_note(first: Run, second: Run) -> tuple[str, ...]:
+    """Say which files of weights are not the same in two runs: their arms differ in these, whatever their names."""
+    before, after = (dict(run.info.get("weights") or {}) for run in (first, second))
+    changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
+    return (f"other weights: {', '.join(changed)}",) if changed else ()
+
+
+def _names_policy(baseline: str | None, table: RolloutTable) -> bool:
+    """Tell whether a baseline says with which policy to compare."""
+    arms = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
+    return baseline in {*table.policies, *(arm.name for arm in arms)} and baseline not in table.renderers
 
 
 def _pairs(

@@ -17,11 +17,12 @@ from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.sides import Row, Side, by_renderer, failure_of, is_ok
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import PRESETS
+from evaluators.statistics.arms import Arm, Base, as_policy, base_named, short_name, usual_base
 from evaluators.statistics.baselines import of_policy, policies_of
 from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, worst
 
-DOING = "reading a gate"
+DOING, DOING_JUDGE = "reading a gate", "judging a run"
 LIBRARY = Path(__file__).resolve().parents[2] / "configs" / "gates"
 
 
@@ -51,7 +52,8 @@ class GateSpec(_Strict):
     description: str = Field(default="", description="One sentence for people.")
     preset: str | None = Field(default=None, description="Evaluator preset that the run must have been scored with.")
     baseline: str | None = Field(
-        default=None, description="Renderer to compare with; none: the run's first, or the same name in the stored baseline."
+        default=None,
+        description="RENDERER, POLICY or both with a slash to compare with; none: the first, or the same of a stored baseline.",
     )
     renderers: tuple[str, ...] = Field(default=(), description="Renderers to judge; none: all but the baseline.")
     min_scenes: int = Field(default=2, ge=2, description="Fewest scenes with a pair that a paired verdict may stand on.")
@@ -186,24 +188,23 @@ def judge_sides(
     if not any(sides.values()):
         raise InputError("judging a run", "its rollouts", "there are none", "give a run with rollouts")
     checks: list[Check] = []
-    for policy, here in sides.items():
-        there = here if stored is None else stored.get(policy, {})
-        for renderer in _judged(here, spec, stored is not None):
-            base = spec.baseline or (renderer if stored is not None else next(iter(here)))
-            if base not in there and any(rule.margin is not None for rule in spec.metrics.values()):
-                where = "the stored baseline" if stored is not None else "the run"
-                others = ", ".join(there) or "no rollout of this policy"
-                raise InputError("judging a run", f"baseline {base!r}", f"{where} does not have it", f"choose one of: {others}")
-            for name, rule in spec.metrics.items():
-                metric, side = known.info(name), here[renderer]
-                if rule.margin is not None:
-                    checks.append(_margin(side, there[base], (renderer, policy), base, metric, rule, spec))
-                if rule.max is not None or rule.min is not None:
-                    checks.append(_limit(side, (renderer, policy), metric, rule))
+    arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
+    has_margin = any(rule.margin is not None for rule in spec.metrics.values())
+    base, there = _base(arms, spec, stored, has_margin), sides if stored is None else stored
+    for arm in _judged(arms, spec, base, has_margin):
+        side = sides[arm.policy][arm.renderer]
+        other = _partner(arm, base, there, stored is not None) if has_margin else arm
+        behind = as_policy(there[other.policy][other.renderer], arm.policy) if has_margin else side
+        for name, rule in spec.metrics.items():
+            metric = known.info(name)
+            if rule.margin is not None:
+                checks.append(_margin(side, behind, (arm.renderer, arm.policy), short_name(other, arm), metric, rule, spec))
+            if rule.max is not None or rule.min is not None:
+                checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
     found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
     outcome = worst([outcome_of_failures(failures, spec.max_failed), *found])
-    first = next(iter(next(iter(sides.values()))))
-    name = stored_name if stored is not None else f"renderer {spec.baseline or first} of the same run"
+    kind = "" if base is None or (base.renderer and base.policy) else "renderer " if base.renderer else "policy "
+    name = stored_name if base is None or stored is not None else f"{kind}{base.name} of the same run"
     return GateVerdict(outcome, tuple(checks), failures, name)
 
 
@@ -220,20 +221,46 @@ def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
     return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
 
 
-def _judged(here: Sides, spec: GateSpec, has_stored: bool) -> list[str]:
-    absent = [name for name in spec.renderers if name not in here]
+def _base(arms: Sequence[Arm], spec: GateSpec, stored: Mapping[str, Sides] | None, has_margin: bool) -> Base | None:
+    """Return what arms are compared with; None: with the same arm of a stored baseline, or limits alone hold for all policies."""
+    if spec.baseline is None:
+        by_policy_alone = len({arm.renderer for arm in arms}) == 1 and not has_margin
+        return None if stored is not None or by_policy_alone else usual_base(arms)
+    there = arms if stored is None else [Arm(renderer, policy) for policy, here in stored.items() for renderer in here]
+    return base_named(spec.baseline, there, DOING_JUDGE, "the run" if stored is None else "the stored baseline")
+
+
+def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: bool) -> list[Arm]:
+    known = {arm.renderer for arm in arms}
+    absent = [name for name in spec.renderers if name not in known]
     if absent:
-        raise InputError("judging a run", f"renderers {absent}", "the run has none of these", f"it has {', '.join(here)}")
+        raise InputError(DOING_JUDGE, f"renderers {absent}", "the run has none of these", f"it has {', '.join(sorted(known))}")
     if spec.renderers:
-        return list(spec.renderers)
-    if has_stored and spec.baseline is None:
-        return list(here)
-    base = spec.baseline or next(iter(here))
-    judged = [name for name in here if name != base]
-    if not judged and any(rule.margin is not None for rule in spec.metrics.values()):
-        do = "run two renderers, or give --baseline-file"
-        raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", do)
-    return judged or [base]  # a gate of limits alone needs no second renderer
+        return [arm for arm in arms if arm.renderer in spec.renderers]
+    judged = [arm for arm in arms if base is None or base.of(arm) != arm]
+    if not judged and has_margin and base is not None:
+        do = "run two renderers or two policies, or give --baseline-file"
+        raise InputError(DOING_JUDGE, f"baseline {base.name!r}", "the run has nothing else to compare with it", do)
+    return judged or list(arms)  # a gate of limits alone needs no second arm
+
+
+def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored: bool) -> Arm:
+    """Return the arm that an arm is compared with; of a stored baseline of one other policy, that policy's.
+
+    Raises:
+        InputError: There is none.
+    """
+    known = [Arm(renderer, policy) for policy, here in there.items() for renderer in here]
+    wanted = arm if base is None else base.of(arm)
+    if wanted not in known and base is None and len(there) == 1:
+        wanted = Arm(arm.renderer, next(iter(there)))
+    if wanted in known:
+        return wanted
+    where = "the stored baseline" if is_stored else "the run"
+    names = ", ".join(one.name for one in known)
+    raise InputError(
+        DOING_JUDGE, f"baseline {wanted.name!r}", f"{where} does not have it", f"`baseline` of the gate may be one of: {names}"
+    )
 
 
 def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec) -> Check:

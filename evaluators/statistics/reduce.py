@@ -18,7 +18,9 @@ from evaluators.metrics import METRICS
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
 
-EVENTS = ("collision_front", "collision_lateral", "collision_rear", "offroad")
+EVENTS = (
+    "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane", "left_route", "stalled", "braked_without_cause"
+)  # fmt: skip
 
 NEVER_ENGAGED = "the policy never took over: every step belongs to the warm-up"
 BLACK = "dropped: a camera image is black in the scored part"

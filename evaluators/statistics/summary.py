@@ -15,6 +15,7 @@ from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.run_folder.schema import cell_name
 from alpasim_plugin.run_folder.sides import RendererRows, Row, Side, by_renderer, failure_of, metric_names, reason_of
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.statistics.arms import Arm, axis_bases
 from evaluators.statistics.intervals import (
     cluster_bootstrap,
     clustered,
@@ -27,7 +28,7 @@ from evaluators.statistics.intervals import (
     wilson_rate,
     within,
 )
-from evaluators.statistics.paired import Table, base_pairs, paired_sides
+from evaluators.statistics.paired import LISTED, Table, base_pairs, compare, paired_sides
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
@@ -204,19 +205,23 @@ NO_BASES: Mapping[str, str] = {}
 def numbers(
     table: RolloutTable, baseline: str | None = None, bases: Mapping[str, str] = NO_BASES, known: MetricTable = METRICS
 ) -> dict[str, Any]:
-    """Return the blocks ``metrics``, ``paired`` and ``paired_with_base`` of ``summary.json`` (docs/statistics.md).
+    """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_arms`` of ``summary.json`` (docs/statistics.md).
 
     Args:
         table: The rollouts.
-        baseline: Renderer that the others are compared with; None, or one that a policy did not meet, is the first.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; what it does not name, or a policy did not meet,
+            is the first of its kind.
         bases: Renderer with a fixer -> the renderer below it; where both were driven and it is not the baseline, the two are paired too.
         known: What the metrics are.
     """
     sides = {policy: table.sides(policy) for policy in table.policies}
+    arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
+    by_renderer_base, by_policy_base = axis_bases(arms, baseline)
     chosen: dict[str, str | None] = {}  # None where there is nothing to compare
     for policy, here in sides.items():
         first = next(iter(here), None) if len(here) > 1 else None
-        chosen[policy] = baseline if len(here) > 1 and baseline in here else first
+        named = None if by_renderer_base is None else by_renderer_base.renderer
+        chosen[policy] = named if len(here) > 1 and named in here else first
     metrics = {policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()}
     paired: dict[str, Table] = {}
     with_base: dict[str, Table] = {}
@@ -225,7 +230,41 @@ def numbers(
         paired[policy] = {} if base is None else paired_sides(here, table.metrics, base, known=known)
         with_base[policy] = base_pairs(here, table.metrics, base, bases, known)
     parts = {"metrics": metrics, "paired": paired, "paired_with_base": with_base}
-    return {name: by_policy(part, dict) for name, part in parts.items()}
+    arm_pairs = [] if by_policy_base is None else by_policy_base.pairs(arms)
+    return {name: by_policy(part, dict) for name, part in parts.items()} | {"paired_arms": paired_arms(table, arm_pairs, known)}
+
+
+def paired_arms(
+    table: RolloutTable,
+    pairs: Sequence[tuple[Arm, Arm]],
+    known: MetricTable = METRICS,
+    base: RolloutTable | None = None,
+    margins: Mapping[str, float] | None = None,
+    listed: int = LISTED,
+    prefix: str = "",
+) -> Table:
+    """Compare arms with arms, scene by scene and seed by seed; their policies may differ.
+
+    Args:
+        table: The rollouts of the first arm of each pair.
+        pairs: Arm, and the arm that it is compared with.
+        known: What the metrics are.
+        base: The rollouts of the second arm of each pair; None: the same table.
+        margins, listed: As for `paired`.
+        prefix: Of the name of the arm that is compared with.
+
+    Returns:
+        RENDERER/POLICY -> METRIC -> what `compare` gives.
+    """
+    base = table if base is None else base
+    out: Table = {}
+    for arm, other in pairs:
+        here, there = table.sides(arm.policy)[arm.renderer], base.sides(other.policy, arm.policy)[other.renderer]
+        out[arm.name] = {
+            name: compare(here, there, known.info(name), prefix + other.name, (margins or {}).get(name), listed)
+            for name in dict.fromkeys([*table.metrics, *base.metrics])
+        }
+    return out
 
 
 def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> dict[str, Any]:

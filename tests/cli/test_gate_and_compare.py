@@ -241,3 +241,50 @@ def test_runs_of_another_preset_or_scene_content_are_not_compared(runs, tmp_path
     vouch_for(other)
     assert run_command(["compare", str(runs["good"]), str(other)]) == 2
     assert "presets 'paper' and 'strict'" in capsys.readouterr().err
+
+
+def arms_run(folder: Path, renderers: tuple[str, ...], policies: tuple[str, ...]) -> Path:
+    return vouch_for(make_run(folder, plan(renderers=renderers, policies=policies, scenes=SCENES[:4], seeds=(0,))))
+
+
+def test_policies_behind_one_renderer_are_compared_and_judged_within_a_run(tmp_path, capsys):
+    run = arms_run(tmp_path / "run", ("clean",), ("a", "b", "c"))
+    assert run_command(["compare", str(run), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {name: entries["progress"]["baseline"] for name, entries in said["paired_arms"].items()} == {
+        "clean/b": "clean/a",
+        "clean/c": "clean/a",
+    }
+    turned = _compare(capsys, str(run), "--baseline", "c")
+    assert set(turned) == {"clean/a", "clean/b"}
+    forward = said["paired_arms"]["clean/c"]["lateral_distance_m"]["diff"]
+    assert turned["clean/a"]["lateral_distance_m"]["diff"] == pytest.approx(-forward)
+    gate = tmp_path / "gate.yaml"
+    gate.write_text("version: 1\nbaseline: b\nmetrics:\n  progress: {margin: 0.9}\n")
+    run_command(["gate", str(run), "--gate", str(gate), "--json"])
+    verdict = json.loads(capsys.readouterr().out)
+    assert verdict["baseline"] == "policy b of the same run"
+    assert [(check["policy"], check["entry"]["baseline"]) for check in verdict["checks"]] == [("a", "b"), ("c", "b")]
+
+
+def test_any_arm_is_a_baseline_where_renderers_and_policies_differ(tmp_path, capsys):
+    run = arms_run(tmp_path / "run", ("clean", "3dgs"), ("a", "b"))
+    found = _compare(capsys, str(run), "--baseline", "clean/a")
+    assert set(found) == {"clean/b", "3dgs/a", "3dgs/b"}
+    assert {entry["baseline"] for entries in found.values() for entry in entries.values()} == {"clean/a"}
+    assert run_command(["compare", str(run), "--baseline", "omnidreams"]) == 2
+    assert "choose one of clean, 3dgs, a, b, clean/a, 3dgs/a, clean/b, 3dgs/b" in capsys.readouterr().err
+
+
+def test_another_policy_of_a_stored_baseline_is_named_or_the_only_one(tmp_path, capsys):
+    stored, run = arms_run(tmp_path / "stored", ("clean",), ("a",)), arms_run(tmp_path / "run", ("clean",), ("b",))
+    gate = tmp_path / "gate.yaml"
+    gate.write_text("version: 1\nmetrics:\n  progress: {margin: 0.9}\n")
+    run_command(["gate", str(run), "--gate", str(gate), "--baseline-file", str(stored), "--json"])
+    (check,) = json.loads(capsys.readouterr().out)["checks"]
+    assert (check["policy"], check["entry"]["baseline"], check["entry"]["n_scenes"]) == ("b", "a", 4)
+    two = arms_run(tmp_path / "two", ("clean",), ("a", "c"))
+    assert run_command(["gate", str(run), "--gate", str(gate), "--baseline-file", str(two)]) == 2
+    assert "may be one of: clean/a, clean/c" in capsys.readouterr().err
+    assert run_command(["compare", str(two), str(run), "--baseline", "c", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["paired"]["clean/b"]["progress"]["baseline"] == f"{two}: clean/c"

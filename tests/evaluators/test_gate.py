@@ -112,11 +112,11 @@ def test_a_stored_baseline_meets_the_renderer_of_the_same_name():
 
 def test_names_that_are_not_there_are_refused():
     one = rows(renderer="clean")
-    with pytest.raises(InputError, match="the run has no other renderer"):
+    with pytest.raises(InputError, match="the run has nothing else to compare with it"):
         judge(one, gate())
     with pytest.raises(InputError, match="the run has none of these"):
         judge([*one, *rows()], gate(renderers=("onefixer",)))
-    with pytest.raises(InputError, match="choose one of: clean, 3dgs"):
+    with pytest.raises(InputError, match="choose one of clean, 3dgs"):
         judge([*one, *rows()], gate(baseline="onefixer"))
     limits = gate(metrics={"img_is_black": MetricRule(max=0.0)})
     assert judge(one, limits).exit_code == 0  # limits need no second renderer

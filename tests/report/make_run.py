@@ -93,15 +93,15 @@ def _write_flips(folder: Path, plan: Plan) -> None:
     flips, compared = find_flips(read_run(folder))
     cells = []
     for number, flip in enumerate(flips):
-        key = dict(zip(("renderer", "policy", "scene", "seed"), flip.key, strict=True)) | {"baseline": flip.base.renderer}
+        key = dict(zip(("renderer", "policy", "scene", "seed", "against"), flip.key, strict=True)) | {"baseline": flip.base.renderer}
         if number == 1:
             cells.append(key | {"t_us": None, "reason": "the plans never diverge by more than 0.5 m"})
             continue
         frames = {}
-        for side, rollout in enumerate((flip.base, flip.other)):
-            frames[rollout.renderer] = f"flips/{number:03d}-{side}.jpg"
+        for side, (name, rollout) in enumerate(zip(flip.sides, (flip.base, flip.other), strict=True)):
+            frames[name] = f"flips/{number:03d}-{side}.jpg"
             (folder / "flips").mkdir(exist_ok=True)
-            cv2.imwrite(str(folder / frames[rollout.renderer]), _picture(rollout.renderer, 2, *plan.picture_px))
+            cv2.imwrite(str(folder / frames[name]), _picture(rollout.renderer, 2, *plan.picture_px))
         part_us = 1_000_000 + 100_000 * number
         cells.append(key | {"t_us": part_us, "after_us": part_us, "gap_m": 0.5 + 0.01 * number, "source": "logs", "frames": frames})
     _json(folder / "flips.json", {"threshold_m": 0.5, "horizon_s": 3.0, "n_flips": len(flips), "n_pairs": compared, "cells": cells})

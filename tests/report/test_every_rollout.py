@@ -15,7 +15,7 @@ import pytest
 
 from evaluators.opening import Run, read_run
 from evaluators.report import rollouts
-from evaluators.report.rollouts import COLLIDED, FAILED, HAS_CLIP, HAS_FOLDER, LEFT_ROAD, rollout_block
+from evaluators.report.rollouts import COLLIDED, FAILED, HAS_CLIP, HAS_FOLDER, OTHERWISE, rollout_block
 
 TYPES = {"u8": "<u1", "u32": "<u4", "f32": "<f4"}
 
@@ -51,7 +51,7 @@ def test_every_row_and_number_of_the_table_is_in_the_block(run: Run) -> None:
         state = int(found["state"][i])
         assert bool(state & FAILED) is not rollout.ok
         assert bool(state & COLLIDED) is (rollout.ok and rollout.flag("collision_any"))
-        assert bool(state & LEFT_ROAD) is (rollout.ok and rollout.flag("offroad"))
+        assert bool(state & OTHERWISE) is (rollout.ok and rollout.flag("offroad"))
         assert bool(state & HAS_FOLDER) is (run.folder / rollout.path).is_dir()
         assert (rollout.failure_class in found["failure"][i]) if not rollout.ok else found["failure"][i] == ""
     for name in run.metric_names:

@@ -26,7 +26,11 @@ def words_of(run: Run) -> list[str]:
 
 def test_a_run_ends_with_verdict_differences_cost_and_the_next_command(usual_run: Path) -> None:
     run = read_run(usual_run)
-    verdict, *pairs, cost = ending_lines(run)
+    lines = ending_lines(run)
+    at = next(i for i, line in enumerate(lines) if line.startswith("verdict"))
+    assert [line[:9].strip() for line in lines[:at]] == ["outcome", *[""] * (at - 1)]
+    assert at == len(find(run).outcomes) == 6
+    verdict, *pairs, cost = lines[at:]
     assert verdict == f"verdict  {find(run).title}"
     heads = [re.match(r" {9}(\S+ \u2212 \S+): ", line) for line in pairs]
     assert [head[1] for head in heads if head] == ["3dgs \u2212 clean", "onefixer \u2212 clean", "onefixer \u2212 3dgs"]
@@ -49,6 +53,29 @@ def test_changed_outcomes_lead_to_a_probe_of_one_of_them(usual_run: Path) -> Non
     assert words[1] == "probe"
     renderer, policy, *scene, seed = words[words.index("--cell") + 1].split("/")
     assert (renderer, policy, "/".join(scene), int(seed)) in {rollout.cell for rollout in run.rollouts}
+
+
+def test_every_next_command_of_any_set_of_arms_can_be_given(tmp_path: Path) -> None:
+    for number, (renderers, policies, harm) in enumerate(
+        [
+            (("clean",), ("lane-camera", "pure-pursuit", "learned"), 0.8),
+            (("clean",), ("lane-camera", "pure-pursuit"), 0.0),
+            (("clean", "3dgs"), ("lane-camera", "pure-pursuit"), 2.6),
+            (("clean", "3dgs", "onefixer"), ("lane-camera",), 0.0),
+            (("clean", "3dgs", "onefixer"), ("lane-camera", "pure-pursuit"), 0.0),
+            (("onefixer",), ("lane-camera",), 0.4),
+        ]
+    ):
+        plan = Plan(renderers, policies, seeds=(0,), steps=30, harm=dict.fromkeys(renderers, harm), pictures=False, clips=False)
+        run = read_run(make_run(tmp_path / str(number), plan))
+        words = words_of(run)
+        for flag, known in (("--renderers", run.renderers), ("--policy", [*run.policies, "lane-camera"])):
+            if flag in words and words[1] in ("probe", "fork"):
+                assert {*words[words.index(flag) + 1].split(",")} <= {*known}
+        if "--cell" in words:
+            assert words[words.index("--cell") + 1] in {"/".join(map(str, rollout.cell)) for rollout in run.rollouts}
+        if len(renderers) == 1 and len(policies) > 1:
+            assert words[1] in ("fork", "view", "--renderer")
 
 
 def test_one_renderer_leads_to_a_comparison_and_a_failing_policy_to_its_check(tmp_path: Path) -> None:

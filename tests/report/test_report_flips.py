@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.metrics.outcomes import in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import write_report
-from evaluators.report.flips import Flip, events, find_flips, flip_rows, in_words
+from evaluators.report.flips import Flip, find_flips, flip_rows
 from tests.report.make_run import Plan, make_run
 
 
@@ -46,15 +47,15 @@ def test_equal_outcomes_failed_sides_and_missing_partners_are_no_flips() -> None
 
 
 def test_events_name_the_gravest_word_only() -> None:
-    had = events(rollout("clean", collision_any=1.0, collision_at_fault=1.0, offroad=1.0))
+    had = outcomes_of(rollout("clean", collision_any=1.0, collision_at_fault=1.0, offroad=1.0))
     assert in_words(had) == "at-fault collision and off-road"
 
 
 def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
     rows, more, compared = flip_rows(read_run(usual_run), 10**7)
-    assert (more, compared) == (0, 44)  # 48 pairs less two failed cells, which both policies share
+    assert (more, compared) == (0, 44 + 34)  # 48 pairs of renderers, 36 of policies; two cells failed with both policies
     assert len(rows) > 3
-    assert [name for name, *_ in rows[0].pictures] == ["clean", rows[0].flip.other.renderer]
+    assert [name for name, *_ in rows[0].pictures] == list(rows[0].flip.sides)
     assert rows[0].time.text == "1.0\u00a0s"
     assert rows[0].gap.text == "0.500\u00a0m"
     assert rows[1].time.missing
@@ -64,6 +65,19 @@ def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
     )
     with_clip = next(row for row in rows if row.flip.other.seed == 0)
     assert all(clip is not None and clip.endswith("front.mp4") for _, _, clip, _ in with_clip.links)
+
+
+def test_policies_behind_one_renderer_flip_as_renderers_do() -> None:
+    rollouts = [Rollout("clean", policy, "s", 0, "ok", metrics={"offroad": value}) for policy, value in (("a", 0.0), ("b", 1.0))]
+    (flip,), compared = find_flips(Run(Path(), {"renderers": ["clean"], "policies": ["a", "b"]}, {}, rollouts, ()))
+    assert (compared, flip.sides, flip.was, flip.now) == (1, ("a", "b"), "no event", "off-road")
+    assert flip.key == ("clean", "b", "s", 0, "clean/a")
+
+
+def test_a_drive_that_the_policy_broke_off_is_an_outcome() -> None:
+    broken = Rollout("3dgs", "p", "s", 0, "failed", "policy")
+    (flip,), _ = find_flips(run_of(rollout("clean"), broken))
+    assert (flip.was, flip.now, flip.tone) == ("no event", "policy fault", "worse")
 
 
 def test_pictures_stop_at_the_budget_and_say_so(usual_run: Path) -> None:
@@ -97,7 +111,7 @@ def test_a_run_whose_pairs_all_end_alike_says_so(tmp_path: Path) -> None:
     folder = make_run(tmp_path, plan)
     flips: tuple[list[Flip], int] = find_flips(read_run(folder))
     assert flips == ([], 1)
-    assert "None: all 1\u00a0pair of rollouts end as they do behind clean." in write_report(folder).read_text()
+    assert "None: all 1\u00a0pair of rollouts end as they do with clean." in write_report(folder).read_text()
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.opening import Run, read_run
 from evaluators.report.headline import find, tone_of
 from tests.report.make_run import Plan, make_run
@@ -81,9 +82,38 @@ def test_what_a_fixer_does_to_its_own_base_is_said_and_told_apart(usual_run: Pat
 def test_one_renderer_has_numbers_and_no_comparison(tmp_path: Path) -> None:
     finding = find(read_run(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("only",), seeds=(5,), steps=20))))
     assert finding.tone == "neutral"
-    assert finding.title.startswith("3dgs \u2013 collisions: ")
-    assert "of 1" in finding.title
+    assert finding.title in ("3dgs: reaches the end", "3dgs: no event, but the end is not reached") or "3dgs: off-road" in finding.title
+    assert "collisions: 0 of 1" in finding.points[0].text
     assert any("One scene only" in caution for caution in finding.cautions)
+
+
+ARMS = {"renderers": ["clean"], "policies": ["a", "b"]}
+
+
+def of_arms(folder: Path, low: float, high: float, diff: float = 0.0) -> Run:
+    metrics = {name: {"offroad": stats(share, n=3)} for name, share in (("clean/a", 0.0), ("clean/b", diff))}
+    entry = pair(diff, low, high, "undecided") | {"baseline": "clean/a"}
+    cells = [{"scene": "bend", "seed": 0, "t_s": 3.12}]
+    ended = {"n_rollouts": 3, "n_ended": 3, "n_failed": 0, "n_reached_end": 3, "outcomes": {}}
+    fails = ended | {"n_failed": 1, "n_reached_end": 2, "outcomes": {"offroad": {"n": 1, "cells": cells}}}
+    run = with_summary(
+        folder, metrics=metrics, paired={}, paired_arms={"clean/b": {"offroad": entry}}, outcomes={"clean/a": ended, "clean/b": fails}
+    )
+    rollouts = tuple(Rollout("clean", policy, "bend", 0, "ok") for policy in ARMS["policies"])
+    return dataclasses.replace(run, info={**run.info, **ARMS}, rollouts=rollouts)
+
+
+def test_one_renderer_and_two_policies_give_outcomes_and_a_verdict_between_the_policies(usual_run: Path) -> None:
+    finding = find(of_arms(usual_run, -0.1, 0.8, 1 / 3))
+    assert finding.head == "a: all 3 reach the end; b: off-road in 1 of 3 (bend at 3.1 s); 2 of 3 reach the end"
+    assert finding.title == "No difference shown between b and a"
+    assert "1 of 3 against 0 of 3" in finding.points[0].text
+
+
+def test_no_difference_says_what_is_excluded_and_what_is_not(usual_run: Path) -> None:
+    text = find(of_arms(usual_run, -0.71, 0.71)).points[0].text
+    assert text == "off-road rollouts: 0 of 3 in both; a difference beyond 71.0\u00a0points is excluded, a smaller one is not"
+    assert "no difference at all" not in text
 
 
 def test_empty_run_says_so(tmp_path: Path) -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaluators.opening import read_run
 from evaluators.report import write_junit
-from evaluators.report.ci import clean
+from evaluators.report.ci import clean, junit
 from tests.report.make_run import Plan, make_run
 
 
@@ -19,7 +20,7 @@ def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
     assert len(cases) == int(suite.attrib["tests"]) == 72
     assert len({(c.attrib["classname"], c.attrib["name"]) for c in cases}) == 72
     assert sum(c.find("error") is not None for c in cases) == int(suite.attrib["errors"]) == 4
-    assert suite.attrib["failures"] == "0"
+    assert sum(c.find("failure") is not None for c in cases) == int(suite.attrib["failures"]) > 0
     case = next(c for c in cases if (c.attrib["classname"], c.attrib["name"]) == ("urban/left-turn", "3dgs/lane-camera/1"))
     error = case.find("error")
     assert error is not None
@@ -36,11 +37,17 @@ def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run: Path) -
     assert values["path"].startswith("rollouts/")
 
 
-def test_collision_is_not_a_failure_by_itself(usual_run: Path) -> None:
-    root = ET.parse(write_junit(usual_run)).getroot()
-    collided = [c for c in root.iter("testcase") if any(p.attrib == {"name": "collision_any", "value": "1.0"} for p in c.iter("property"))]
-    assert collided
-    assert all(c.find("failure") is None and c.find("error") is None for c in collided)
+def test_an_outcome_is_a_failed_case_of_the_run_and_a_property_of_the_case_in_a_gate(usual_run: Path) -> None:
+    for root, fails in ((junit(read_run(usual_run)), True), (junit(read_run(usual_run), outcomes_fail=False), False)):
+        cases = [c for c in root.iter("testcase") if any(p.attrib == {"name": "collision_any", "value": "1.0"} for p in c.iter("property"))]
+        assert cases
+        for case in cases:
+            failure = case.find("failure")
+            assert (failure is not None) == fails
+            assert failure is None or "at-fault collision" in failure.attrib["message"]
+            (said,) = [p.attrib["value"] for p in case.iter("property") if p.attrib["name"] == "outcome"]
+            assert said.startswith("at-fault collision")
+        assert (root.attrib["failures"] == "0") != fails
 
 
 def test_hostile_names_and_control_characters_give_readable_xml(hostile_run: Path) -> None:

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.cli.decide import plan_of as plan_for
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.options import What
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST
-from alpasim_plugin.runtime.decide import Decided, Design, drawing_order, execute_decision, key_of
+from alpasim_plugin.runtime.decide import Decided, Design, arms_asked, drawing_order, execute_decision, key_of
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from evaluators.opening import read_run
 from evaluators.report.html import render_report
@@ -302,3 +304,33 @@ def test_seeds_are_chosen_as_the_run_goes(tmp_path: Path) -> None:
     assert all(1 <= m <= 3 for m in seeds)
     assert decided.record["rollouts"] == 2 * sum(3 * m for m in seeds)
     assert decided.outcome.exit_code == 0
+
+
+def test_two_policies_behind_one_renderer_are_decided_between(tmp_path: Path) -> None:
+    ref = expand("smoke/straight", SHORT)[0]
+    refs = [ScenarioRef(ref.path, seed, ref.overrides) for seed in range(1, 5)]
+    plan = make_plan(refs, (GREY,), ("constant-velocity", BY_GREY), (0,), RunOptions(images="none", baseline="constant-velocity"))
+    decided, _ = decide(tmp_path / "run", SAME, plan, Design(look_every=2, budget=4))
+    assert (decided.record["baseline"], decided.record["candidate"]) == ("constant-velocity", BY_GREY)
+    assert len(read_run(tmp_path / "run").rollouts) == 4
+
+
+@pytest.mark.parametrize(
+    ("renderers", "policies", "baseline", "arms"),
+    [
+        ("clean", "constant-velocity,pure-pursuit", None, ("clean/constant-velocity", "clean/pure-pursuit")),
+        ("clean", "constant-velocity,pure-pursuit", "pure-pursuit", ("clean/pure-pursuit", "clean/constant-velocity")),
+        ("clean,3dgs", "pure-pursuit", None, ("clean/pure-pursuit", "3dgs/pure-pursuit")),
+        ("clean,3dgs", "constant-velocity,pure-pursuit", "3dgs/pure-pursuit", ("3dgs/pure-pursuit", "clean/constant-velocity")),
+    ],
+)
+def test_any_two_arms_can_be_asked_about(renderers: str, policies: str, baseline: str | None, arms: tuple[str, str]) -> None:
+    plan = plan_for(What(("smoke/straight",), renderers, policies), RunOptions(images="none", baseline=baseline))
+    assert tuple(arm.name for arm in arms_asked(plan)) == arms
+    assert {f"{cell.renderer.name}/{cell.policy.name}" for cell in plan.cells} == {*arms}
+
+
+def test_four_arms_without_one_of_them_as_baseline_are_refused() -> None:
+    for baseline in (None, "clean"):
+        with pytest.raises(InputError, match="which of four arms is in question"):
+            plan_for(What(("smoke/straight",), "clean,3dgs", "constant-velocity,pure-pursuit"), RunOptions(baseline=baseline))

@@ -67,6 +67,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "collision": ("evaluators.metrics.collision:FACTORY", "contact with other actors by class, and the distance to them"),
         "offroad": ("evaluators.metrics.offroad:FACTORY", "off-road, wrong lane and the distance to the lanes' border"),
         "route": ("evaluators.metrics.route:FACTORY", "distance from the recorded drive, progress and distance driven"),
+        "outcomes": ("evaluators.metrics.outcomes:FACTORY", "standstill and braking without a cause, and leaving the route"),
         "plan": ("evaluators.metrics.plan:FACTORY", "plan deviation, open-loop collision and minADE of the plans"),
         "image_health": ("evaluators.metrics.image_health:FACTORY", "black and frozen camera images"),
     },

@@ -3,7 +3,7 @@
   const holder = document.getElementById("rollouts-data");
   if (!holder) return;
   const ROW = 34, SPARE = 8; // height of a row in pixels, as in the style sheet; rows drawn beyond the edges
-  const COLLIDED = 1, LEFT_ROAD = 2, FAILED = 4, HAS_FOLDER = 8, HAS_CLIP = 16;
+  const COLLIDED = 1, OTHERWISE = 2, FAILED = 4, HAS_FOLDER = 8, HAS_CLIP = 16;
   const at = (id) => document.getElementById(id);
   const box = at("rollouts-box"), table = at("table-rollouts"), head = table.tHead.rows[0], body = table.tBodies[0], picked = at("rollouts-picked");
   const make = (tag, text, more = {}) => Object.assign(document.createElement(tag), text === undefined ? {} : { textContent: text }, more);
@@ -40,8 +40,8 @@
       return (shortly.format(one.percent ? 100 * value : value) + (one.percent ? "\u00a0%" : one.unit ? "\u00a0" + one.unit : "")).replace("-", "\u2212");
     };
     const quoted = (word) => /^[\w./@+-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`; // for a shell
-    const outcome = (row) => state[row] & FAILED ? "failed" : [state[row] & COLLIDED && "collision", state[row] & LEFT_ROAD && "off-road"].filter(Boolean).join(", ") || "no event";
-    const tone = (row) => state[row] & FAILED ? "failed" : state[row] & COLLIDED ? "collision" : state[row] & LEFT_ROAD ? "offroad" : "";
+    const outcome = (row) => text("outcome", row);
+    const tone = (row) => state[row] & FAILED ? "failed" : state[row] & COLLIDED ? "collision" : state[row] & OTHERWISE ? "offroad" : "";
 
     // Which columns are drawn: names, the outcome, the headline numbers that are no flags, and one more of choice.
     const more = at("rollouts-more");
@@ -61,7 +61,7 @@
       return rank;
     };
     const keyOf = (one) => {
-      if (one.name === "outcome") return (row) => state[row] & (COLLIDED | LEFT_ROAD | FAILED);
+      if (one.name === "outcome") return (row) => state[row] & (COLLIDED | OTHERWISE | FAILED);
       if (!one.names) return (row) => one.data[row];
       const rank = ranks(one.name), { data } = column(one.name);
       return (row) => rank[data[row]];

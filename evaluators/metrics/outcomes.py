@@ -1,0 +1,215 @@
+"""How a drive ends, in words: every outcome is defined here once, and those that no other evaluator gives are found here.
+
+An ego that is much slower than the recording is excused where it has a cause: a road user on the recorded path ahead of it or about to
+be there, a place at which the recording was slow as well, or the end of the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.metrics.presets import Preset
+from evaluators.metrics.route import DIRECTION_M, beside, recorded_path, to_path
+from evaluators.metrics.score import handover_us, series, with_preset
+
+if TYPE_CHECKING:
+    from alpasim_plugin.run_folder.rows import Rollout
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One way in which a drive fails.
+
+    Attributes:
+        name: Its metric, or the failure class of a rollout that has no metrics.
+        words: What sentences call it.
+        letter: What the chips of a scene table show.
+        implied_by: Outcomes that say more, beside which this one is not named.
+    """
+
+    name: str
+    words: str
+    letter: str
+    implied_by: tuple[str, ...] = ()
+
+
+POLICY_FAULT = "policy"  # the failure class of a rollout that the policy broke
+OUTCOMES = {  # the gravest first
+    one.name: one
+    for one in (
+        Outcome(POLICY_FAULT, "policy fault", "P"),
+        Outcome("collision_at_fault", "at-fault collision", "C"),
+        Outcome("collision_any", "collision", "C", ("collision_at_fault",)),
+        Outcome("offroad", "off-road", "O"),
+        Outcome("wrong_lane", "wrong lane", "W"),
+        Outcome("left_route", "left the route", "R"),
+        Outcome("stalled", "stalled", "S"),
+        Outcome("braked_without_cause", "braked without cause", "B", ("stalled",)),
+    )
+}
+NO_OUTCOME = "no event"
+REACHED = 0.95  # share of the recorded path from which on a drive has reached its end
+
+
+def outcomes_of(rollout: Rollout) -> frozenset[str]:
+    """Return the names of the outcomes of a rollout; none where another part of the program failed."""
+    if not rollout.ok:
+        return frozenset({POLICY_FAULT} if rollout.failure_class == POLICY_FAULT else ())
+    return frozenset(name for name in OUTCOMES if rollout.flag(name))
+
+
+def told(had: Iterable[str]) -> list[Outcome]:
+    """Return the outcomes that are named, the gravest first."""
+    names = set(had)
+    return [one for name, one in OUTCOMES.items() if name in names and not names & set(one.implied_by)]
+
+
+def in_words(had: Iterable[str]) -> str:
+    """Name outcomes.
+
+    Example:
+        >>> in_words({"collision_any", "collision_at_fault", "offroad"}), in_words(())
+        ('at-fault collision and off-road', 'no event')
+    """
+    return " and ".join(one.words for one in told(had)) or NO_OUTCOME
+
+
+def event_words(metric: str) -> str:
+    """Name an event of a manifest: an outcome, or the side of a contact as the collision that it is."""
+    return OUTCOMES[metric].words if metric in OUTCOMES else OUTCOMES["collision_any"].words
+
+
+def has_ended(rollout: Rollout) -> bool:
+    """Tell whether the outcome of a rollout is known: it ran to its end, or the policy broke it."""
+    return rollout.ok or rollout.failure_class == POLICY_FAULT
+
+
+def reached_end(rollout: Rollout) -> bool:
+    """Tell whether a drive without a failure came to the end of the recorded path."""
+    return rollout.ok and not outcomes_of(rollout) and (rollout.metrics.get("progress") or 0.0) >= REACHED
+
+
+LEFT_ROUTE_M = 4.0  # AlpaSim's corridor
+STAND_MPS, STAND_S = 0.3, 3.0
+SLOW_SHARE, LEAST_MPS, SLOW_S = 0.5, 2.0, 1.0
+AHEAD_M, AHEAD_S, BEHIND_M = 15.0, 3.0, 2.0  # where a road user, or a slow place of the recording, is a cause
+BESIDE_M = 1.0  # between the ego's way and a road user
+SOON_S = (0.0, 1.0, 2.0)  # when a road user may be there
+AFTER_S = 3.0  # what has been a cause excuses for so long
+
+
+def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+    """Give ``stalled``, ``braked_without_cause`` and ``left_route`` per step."""
+    t_us, origin = rollout.ego.t_us, origin_of(rollout.ego_log, preset)
+    path = recorded_path(rollout, preset)
+    ego = ego_footprints(rollout, preset, origin)
+    line = path.xyz[:, :2] - origin[:2]
+    distance_m, s = to_path(line, ego.xy)
+    aside_m = beside(line, s, ego.xy, distance_m)
+    has_side = np.isfinite(aside_m)
+    why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
+    stalled, braked = _slow(rollout, preset, line, path.t_us, s)
+    return [
+        series("stalled", t_us, stalled, has_side, why),
+        series("braked_without_cause", t_us, braked, has_side, why),
+        series("left_route", t_us, np.nan_to_num(aside_m) >= LEFT_ROUTE_M, has_side, why),
+    ]
+
+
+def _slow(rollout: RolloutLog, preset: Preset, line: F64, recorded_us: I64, s: F64) -> tuple[Bool, Bool]:
+    """Return at which steps ``(T,)`` the ego has stood too long, and has braked without a cause."""
+    t_us = rollout.ego.t_us
+    seconds = (t_us - t_us[0]) * 1e-6
+    v = speeds(seconds, rollout.ego.xyz[:, :2])
+    engaged = t_us >= handover_us(rollout)
+    fastest = np.maximum.accumulate(np.where(engaged, v, 0.0))
+    along, then = arc_lengths(line), (recorded_us - recorded_us[0]) * 1e-6
+    usual, pause_s = recorded_speed(along, then, speeds(then, line), s)
+    expected = np.minimum(fastest, usual)
+    stands = engaged & (v < STAND_MPS)
+    slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
+    ahead = np.zeros(len(t_us), dtype=np.bool_)
+    asked = np.flatnonzero(_recently((stands | slow)[::-1], -seconds[::-1])[::-1])  # what comes before a slow step may excuse it
+    ahead[asked] = actor_ahead(rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, asked)
+    excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
+    stood_s, slow_s = _lasting(stands & ~excused, seconds), _lasting(slow & ~excused, seconds)
+    return stood_s >= STAND_S + pause_s, slow_s >= SLOW_S
+
+
+def speeds(seconds: F64, xy: F64) -> F64:
+    """Return the speed ``(T,)`` along positions ``(T, 2)``, m/s; 0 for a single one."""
+    if len(xy) < 2:
+        return np.zeros(len(xy))
+    return np.asarray(np.hypot(*np.gradient(xy, seconds, axis=0).T))
+
+
+def recorded_speed(along: F64, seconds: F64, v: F64, s: F64) -> tuple[F64, F64]:
+    """Return how the recording drove where the ego is.
+
+    Args:
+        along: ``(N,)`` arc length of the recording.
+        seconds: ``(N,)`` its times.
+        v: ``(N,)`` its speeds, m/s.
+        s: ``(T,)`` arc length of the ego on the recorded path.
+
+    Returns:
+        ``(T,)`` its least speed from there to `AHEAD_M` ahead, m/s, and ``(T,)`` the seconds for which it stood there.
+    """
+    dwell = np.append(np.diff(seconds), 0.0)
+    first = np.clip(np.searchsorted(along, s - BEHIND_M, "right") - 1, 0, None)
+    last = np.maximum(np.searchsorted(along, s + AHEAD_M, "right"), first + 1)
+    windows = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
+    return np.array([v[w].min() for w in windows]), np.array([dwell[w][v[w] < LEAST_MPS].sum() for w in windows])
+
+
+def actor_ahead(rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m: F64, steps: I64) -> Bool:
+    """Return at which of some steps ``(K,)`` a road user is on the recorded path ahead of the ego, or is about to be.
+
+    Args:
+        rollout: The log.
+        preset: Sizes of the footprints.
+        line: ``(N, 2)`` the recorded path.
+        s: ``(T,)`` arc length of the ego on it.
+        reach_m: ``(T,)`` how far ahead counts.
+        steps: ``(K,)`` which steps are asked for.
+    """
+    origin = origin_of(rollout.ego_log, preset)
+    actors = ActorTable(rollout, preset, origin)
+    out = np.zeros(len(steps), dtype=np.bool_)
+    if len(steps) == 0 or len(actors) == 0 or len(line) < 2:
+        return out
+    way, ego_xy = shapely.linestrings(line), rollout.ego.xyz[steps, :2] - origin[:2]
+    s, reach_m = s[steps], reach_m[steps]
+    for soon_s in SOON_S:
+        there = actors.at(rollout.ego.t_us[steps] + round(soon_s * 1e6))
+        actor, step = np.nonzero(there.present & (there.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None]))
+        boxes = there.footprints(actor, step)
+        corners = to_path(line, boxes.corners().reshape(-1, 2))[1].reshape(-1, 4)
+        gap_m = corners.max(axis=1) - s[step]
+        near = (gap_m > 0.0) & (gap_m < reach_m[step] + boxes.size[:, 0])
+        near[near] = shapely.distance(boxes.take(np.flatnonzero(near)).shapes(), way) < rollout.ego_box.width_m / 2 + BESIDE_M
+        out[step[near]] = True
+    return out
+
+
+def _lasting(condition: Bool, seconds: F64) -> F64:
+    """Return for how many seconds ``(T,)`` a condition has held without a break; -1 where it does not."""
+    began = np.maximum.accumulate(np.where(condition & ~np.append(False, condition[:-1]), seconds, -np.inf))
+    return np.where(condition, seconds - np.where(condition, began, 0.0), -1.0)
+
+
+def _recently(condition: Bool, seconds: F64) -> Bool:
+    """Return where a condition holds or has held within `AFTER_S`."""
+    last = np.maximum.accumulate(np.where(condition, seconds, -np.inf))
+    return np.asarray(seconds - last <= AFTER_S)
+
+
+FACTORY = with_preset(evaluate_outcomes)
