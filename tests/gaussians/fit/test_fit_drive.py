@@ -45,12 +45,14 @@ def test_a_view_that_was_kept_is_shown_and_reported_on_the_way(fitted: tuple[Fit
     assert heard[-1] > heard[0]
 
 
-def test_the_depth_of_the_fit_is_the_street_s(fitted: tuple[FittedDrive, object], views: list[PosedView]) -> None:
+def test_after_few_steps_the_depth_of_the_fit_is_already_near_the_street_s(
+    fitted: tuple[FittedDrive, object], views: list[PosedView]
+) -> None:
     out = fitted[0].model.graph().render(views[4].camera, {}, 1)
     truth = true_depth(views[4])
     near = np.isfinite(truth) & (truth < 20) & (out.alpha > 0.5)
     assert near.mean() > 0.4
-    assert np.median(np.abs(out.depth[near] / truth[near] - 1)) < 0.08
+    assert np.median(np.abs(out.depth[near] / truth[near] - 1)) < 0.2
 
 
 def test_the_sky_stays_free_of_gaussians(fitted: tuple[FittedDrive, object], views: list[PosedView]) -> None:
