@@ -13,8 +13,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from alpasim_plugin.nets.pixel_generator import CELL, DETAIL, DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
-from alpasim_plugin.nets.reference_blend import CHANNELS, NOWHERE, BesideCells, BlendHeads
+from alpasim_plugin.nets.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
+from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, NOWHERE, BesideCells, BlendHeads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 

@@ -68,12 +68,14 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
         actor that was not there.
     """
     now = [name for name in sorted(target.actors) if name in boxes]
+    absent = np.full((4, 4), np.nan)
     T_box_world = np.array([inverse(target.actors[name]) for name in now]).reshape(-1, 4, 4)
-    then = [picture.actors.get(name) for name in now]
-    T_then_box = np.array([np.full((4, 4), np.nan) if T is None else T for T in then]).reshape(-1, 4, 4)
+    T_then_box = np.array([picture.actors.get(name, absent) for name in now]).reshape(-1, 4, 4)
     sizes = np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
-    view, then = (target.depth, target.K, target.T_world_camera), (picture.K, inverse(picture.T_world_camera), picture.depth)
-    x, y, held = warp_coordinates(*view, *then, T_box_world, T_then_box, sizes)
+    T_then_world = inverse(picture.T_world_camera)
+    x, y, held = warp_coordinates(
+        target.depth, target.K, target.T_world_camera, picture.K, T_then_world, picture.depth, T_box_world, T_then_box, sizes
+    )
     out = np.empty((*held.shape, 4), np.uint8)
     out[..., :3] = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     out[..., 3] = held
@@ -119,9 +121,8 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
     for row in range(height):
         v0 = row + 0.5
         for column in range(width):
-            z, u0 = np.float64(depth[row, column]), column + 0.5
-            if not z > 0:
-                z = INFINITY_M
+            u0 = column + 0.5
+            z = np.float64(depth[row, column]) if depth[row, column] > 0 else np.float64(INFINITY_M)
             qx = z * (A[0, 0] * u0 + A[0, 1] * v0 + A[0, 2]) + b[0]
             qy = z * (A[1, 0] * u0 + A[1, 1] * v0 + A[1, 2]) + b[1]
             rz = z * (A[2, 0] * u0 + A[2, 1] * v0 + A[2, 2]) + b[2]
@@ -150,8 +151,7 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
                 continue
             x[row, column], y[row, column] = u - 0.5, v - 0.5
             there = np.float64(depth_then[int(v), int(u)])
-            if not there > 0:
-                there = INFINITY_M
+            there = there if there > 0 else np.float64(INFINITY_M)
             far = there > INFINITY_M / 2 and rz > INFINITY_M / 2
             held[row, column] = HELD if far or abs(there - rz) < SLACK * rz + SLACK_M else DOUBTED
 

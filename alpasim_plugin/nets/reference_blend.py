@@ -94,9 +94,9 @@ class ReferenceBlend(nn.Module):
             at4 = activation(conv(at4), inplace=True)
         joined = _repeated(fine, k) + self.own(beside.each2.to(fine.dtype)) + self.up(at4)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
-        weight, offset, correction = said.unflatten(0, (b, k)).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
+        weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
         seen_at4 = F.interpolate(self.shift(at4).float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
-        offset_px = torch.tanh(offset + seen_at4.permute(0, 2, 3, 1).unflatten(0, (b, k))) * OFFSET_PX
+        offset_px = torch.tanh(offset + seen_at4.permute(0, 2, 3, 1).view(offset.shape)) * OFFSET_PX
         return BlendHeads(weight, offset_px, correction)
 
 

@@ -103,7 +103,7 @@ def misplaced(views: Sequence[PosedView], spread_m: float, scene_id: str, seed: 
     """
     if spread_m == 0:
         return list(views)
-    errors = pose_errors(scene_id, seed, spread_m, len(views), np.arange(len(views)))
+    errors = pose_errors(scene_id, seed, spread_m, len(views), np.arange(len(views), dtype=np.float64))
     return [
         replace(view, camera=replace(view.camera, T_camera_world=error @ view.camera.T_camera_world))
         for view, error in zip(views, errors, strict=True)

@@ -111,11 +111,11 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     U += np.diag(weight)
     ga += weight * off
     W = AT @ B  # (M, 6, 3)
-    inverse = np.linalg.inv(V + 1e-6 * np.eye(3))
+    inverse: F64 = np.asarray(np.linalg.inv(V + 1e-6 * np.eye(3)), np.float64)
     H, g = _reduced(U, ga, W, inverse, gb, v, p)
-    step = -np.linalg.solve(H, g).reshape(views, 6)
+    step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), np.float64)
     back = summed(np.einsum("nij,ni->nj", W, step[v]), p, len(xyz))
-    return step, -np.einsum("nij,nj->ni", inverse, gb + back)
+    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, gb + back), np.float64)
 
 
 def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> tuple[F64, F64]:

@@ -133,13 +133,16 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
     masks = sky_masks(measured) if way > LEAST_WAY_M else [None] * len(views)
     gains = balances(views, tracks)
     skies = [mask if view.sky is None else view.sky for view, mask in zip(measured, masks, strict=True)]
-    free = [view.depth if sky is None else np.where(sky, 0, view.depth) for view, sky in zip(measured, skies, strict=True)]
+    free = [
+        view.depth if sky is None or view.depth is None else np.where(sky, np.float32(0), view.depth)
+        for view, sky in zip(measured, skies, strict=True)
+    ]
     done = [
         replace(view, sky=sky, depth=depth, gain=(float(r), float(g), float(b)))
         for view, sky, depth, (r, g, b) in zip(measured, skies, free, gains, strict=True)
     ]
     guesses = [between_points(view.camera, tracks, placed, i) for i, view in enumerate(views)]
-    return done, [None if q is None else 1 / np.maximum(q, np.float32(1e-3)) for q in guesses]
+    return done, [None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32) for q in guesses]
 
 
 def _start(

@@ -235,7 +235,7 @@ class Exposure:
 
     def gains(self) -> F64:
         """Return all gains ``(V, 3)``."""
-        return np.exp(self.log_gain.detach().cpu().double().numpy())
+        return np.asarray(self.log_gain.detach().cpu().double().exp().numpy(), np.float64)
 
     @torch.no_grad()
     def update(self, rate: float) -> None:

@@ -78,7 +78,7 @@ def _corners(grey: U8, taken: F32, mask: Bool | None) -> F32:
 
 
 def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points[:, None], None, winSize=WINDOW, maxLevel=4)  # type: ignore[call-overload]
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points[:, None], None, winSize=WINDOW, maxLevel=4)  # type: ignore[call-overload,unused-ignore]
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=WINDOW, maxLevel=4)
     off = np.linalg.norm(back[:, 0] - points, axis=1)
     moved = there[:, 0]
@@ -110,7 +110,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None]
     A, b = (summed(values, tracks.point, tracks.count) for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view])))
-    xyz = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
+    xyz: F64 = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], np.float64)
     for _ in range(ROUNDS):
         e, J, _ = residuals(xyz, tracks, R, t, K)
         w = huber(e)
@@ -119,7 +119,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         step = np.linalg.solve(H + 1e-9 * np.eye(3) * (1 + np.trace(H, axis1=1, axis2=2)[:, None, None]), g[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         away = np.linalg.norm(xyz - centre.mean(axis=0), axis=1, keepdims=True)
-        xyz = xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12))
+        xyz = np.asarray(xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12)), np.float64)
     e, _, z = residuals(xyz, tracks, R, t, K)
     error = np.where(z > 1e-3, np.linalg.norm(e, axis=1), np.inf)
     return Placed(xyz, error, _angles(xyz, tracks, centre))

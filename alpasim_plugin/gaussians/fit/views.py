@@ -115,7 +115,7 @@ def halved(view: PosedView) -> PosedView:
     rgb = cv2.resize(view.rgb[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)
 
     def all_four(flags: Bool | None) -> Bool | None:
-        return None if flags is None else flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3))
+        return None if flags is None else np.asarray(flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_)
 
     depth = None if view.depth is None else np.ascontiguousarray(view.depth[: 2 * h : 2, : 2 * w : 2])
     small = PinholeCamera(w, h, K, camera.T_camera_world)

@@ -124,9 +124,9 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         if fixer == RAW:
             variants[label] = Variant(label)
             continue
-        fixer, given = split_settings(fixer)
+        fixer, in_brackets = split_settings(fixer)
         name, settings = bundle_fixer(fixer) if fixer.endswith(".safetensors") else (fixer, ())
-        settings = (*settings, *given)
+        settings = (*settings, *in_brackets)
         variants[label] = Variant(label, resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
     if own or not variants:
         raise InputError(

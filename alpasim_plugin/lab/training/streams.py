@@ -212,12 +212,13 @@ class TrainingStreams:
         key = f"streams.{slot}.{number}"
         loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
         lost = draw_lost_resolution(rng, *self.crop) if loses else None
-        references, better, grey = draw_references(rng), float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER), rng.random() < P_GREY
+        references, better = draw_references(rng), float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER)
+        without_colour = rng.random() < P_GREY
         car_class = other if class_colours else None
         map_error, elsewhere = draw_map_error(rng), self.pairs[int(rng.integers(len(self.pairs)))]
         return Episode(
-            kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better, grey,
-            map_error, elsewhere,
+            kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better,
+            without_colour, map_error, elsewhere,
         )  # fmt: skip
 
     def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32]:
@@ -242,9 +243,9 @@ class TrainingStreams:
         elif damaged:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
         render = render + np.float32(episode.better) * (target - render)
-        recorded = pair_references if kind in ("pairs", "identity") else video_references
-        source = episode.sequence if kind in ("pairs", "identity") else clip
-        references = _lit_references(recorded(source, episode.references, index, rows, columns), episode)  # type: ignore[operator]
+        drawn = episode.references, index, rows, columns
+        recorded = pair_references(episode.sequence, *drawn) if kind in ("pairs", "identity") else video_references(clip, *drawn)
+        references = _lit_references(recorded, episode)
         if episode.grey:
             render, target, references[..., :3] = _grey(render, 1), _grey(target, 1), _grey(references[..., :3], -1)
         other = episode.other.clip.sdmap if episode.map_error.kind == "other" else clip.sdmap
