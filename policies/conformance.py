@@ -8,6 +8,7 @@ older frame is accepted; the plan is in time.
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -183,16 +184,19 @@ class Report:
 
 @dataclass(frozen=True)
 class Situation:
-    """A stretch of road driven at a constant speed, with a policy query every 0.1 s."""
+    """A stretch of road driven at a constant speed, with a policy query every 0.1 s; a blank one shows the policy a grey picture."""
 
     name: str
     curvature_1pm: float = 0.0
     speed_mps: float = 10.0
     frame_age_us: int = 0
+    steps: int = STEPS
+    is_blank: bool = False
 
 
 STRAIGHT, LEFT, RIGHT = Situation("straight"), Situation("left", 1 / 60), Situation("right", -1 / 60)
 STANDING, OLD_FRAME = Situation("standing", speed_mps=0.0), Situation("old frame", frame_age_us=STEP_US)
+LONG, BLANK = Situation("long drive", 1 / 200, steps=40), Situation("nothing to see", steps=12, is_blank=True)
 
 
 def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scenario:
@@ -240,7 +244,7 @@ def _checked(policy: Policy, scenario: Scenario, latency_limit_ms: float) -> Rep
     plans: dict[str, list[Plan]] = {}
     durations: list[float] = []
     broken: list[Check] = []
-    for situation in (STRAIGHT, OLD_FRAME) if replays else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING):
+    for situation in (STRAIGHT, OLD_FRAME) if replays else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING, LONG, BLANK):
         made = _drive(policy, situation, used, durations)
         if isinstance(made, str):
             broken.append(Check("plans", False, made))
@@ -267,7 +271,7 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
     def pose(t_us: int) -> F64:
         return T_WORLD_ROAD @ road.pose(situation.speed_mps * (t_us - START_US) * 1e-6)
 
-    for step in range(STEPS):
+    for step in range(situation.steps):
         now = START_US + step * STEP_US
         times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
         T_world_rig = pose(now)
@@ -275,6 +279,7 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
         for name, camera in cameras.items():
             seen_us = now - situation.frame_age_us
             rgb = road.image(camera, inverse(T_WORLD_ROAD) @ pose(seen_us), seed=step)
+            rgb = np.full_like(rgb, 128) if situation.is_blank else rgb
             rgb.setflags(write=False)  # a policy that scribbles on its input is found out
             frames[name] = Frame(seen_us, name, rgb)
         ahead = situation.speed_mps * (now - START_US) * 1e-6 + 80 / 19 * np.arange(20)
@@ -299,7 +304,8 @@ def _drive(policy: Policy, situation: Situation, cameras: dict[str, CameraSpec],
     except SimrunError as error:
         return f"{where} failed: {error.doing}: {error.found}"
     except Exception as error:  # whatever a foreign policy raises is a finding, not a crash of the check
-        return f"{where} raised {type(error).__name__}: {error}"
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{where} raised {type(error).__name__}: {error} in query {len(plans) + 1} ({at.filename}:{at.lineno})"
     return plans
 
 

@@ -14,9 +14,13 @@ from rich.console import Console
 
 from alpasim_plugin.cli.options import Care, Json, Quiet, RunFolder, What, Where, check_preset, parse_seeds, split_policies
 from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_progress, report_line, varied_lines
+from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.io.limits import SOURCE_BYTES
+from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.run_folder.manifests import read_run_json
+from alpasim_plugin.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runtime.certificate import certificate_line
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
@@ -27,6 +31,8 @@ from evaluators.report import ending_lines, fixer_lines, next_line, plan_warning
 from evaluators.statistics.arms import arms_of, base_named
 from scenarios.library import shipped_names
 from scenarios.suite import expand
+
+TRACEBACK_LINES = 4  # of a failure, in the terminal
 
 EPILOG = """
 Examples:
@@ -131,6 +137,8 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
         print(f"warning  {line}")
     for cell in result.summary["failures"]["cells"][:5]:
         print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
+        for line in last_lines(result.root / cell["path"] / OUTPUT_NAME):
+            print(f"        {line}", file=sys.stderr)
     if result.n_failed:
         print(_failed_line(result), file=sys.stderr)
     videos = len(list(result.root.glob("rollouts/*/*/*/*/front.mp4"))) if video != "none" else 0
@@ -142,6 +150,14 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
         print(line)
     print(report_line(result.root))
     print(_by_name(next_line(run)))
+
+
+def last_lines(log: Path) -> list[str]:
+    """Return the end of the traceback in a rollout's log, and the log's name; nothing where there is no log."""
+    if not log.is_file():
+        return []
+    text = read_bytes(log, "reading the log of a rollout", SOURCE_BYTES).decode("utf-8", "replace")
+    return [terminal(line.rstrip()) for line in text.rstrip().splitlines()[-TRACEBACK_LINES:]] + [f"log {log}"]
 
 
 def _by_name(line: str) -> str:

@@ -116,6 +116,7 @@ def run_cell(
         manifest["status"] = "ok"
     except Exception as error:
         manifest |= _failure(error, folder)
+        _log_traceback(error, folder)
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_manifest(folder, manifest)
     return manifest
@@ -167,6 +168,19 @@ def _failure(error: Exception, folder: Path) -> dict[str, Any]:
         "failure_class": "infrastructure",
     }
     return {"status": "failed", "error": found} | trace
+
+
+def _log_traceback(error: Exception, folder: Path) -> None:
+    """Add the traceback of what failed first to the log of the rollout, which the terminal names."""
+    cause = error
+    while isinstance(cause.__cause__, Exception):
+        cause = cause.__cause__
+    text = "".join(traceback.format_exception(cause))
+    with (
+        suppress(OSError),
+        (folder / OUTPUT_NAME).open("a", encoding="utf-8") as log,
+    ):  # the disk may be what failed; the manifest has it too
+        log.write(text)
 
 
 def failed_manifest(cell: Cell, error: SimrunError) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sysconfig
+import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,8 +15,9 @@ from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
 from alpasim_plugin.plugins.interfaces import Policy, Renderer
 
+LIBRARIES = ("site-packages", sysconfig.get_paths()["stdlib"])  # in the paths of files that are nobody's own
 CHECK = "simrun check-policy finds all faults of a policy"
-TRACEBACK = "see the traceback in the rollout's manifest"
+TRACEBACK = "see the traceback in output.log of the rollout"
 
 
 def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
@@ -31,7 +34,7 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
     except SimrunError:
         raise
     except Exception as error:
-        raise RendererError("rendering a frame", name, f"{type(error).__name__}: {error}", TRACEBACK) from error
+        raise RendererError("rendering a frame", name, raised(error), TRACEBACK) from error
     if len(frames) != len(requests):
         raise RendererError(
             "rendering a frame", name, f"{len(frames)} frames for {len(requests)} requests", "return one frame for each request"
@@ -57,6 +60,13 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
     return frame
 
 
+def raised(error: Exception) -> str:
+    """Name an error of a foreign part with the line of that part at which it was raised, or from which a library was called."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__)[1:] if not any(part in frame.filename for part in LIBRARIES)]
+    where = f" at {frames[-1].filename}:{frames[-1].lineno}, in {frames[-1].name}" if frames else ""
+    return f"{type(error).__name__}: {error}{where}"
+
+
 def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:
     """Return the policy's sensors.
 
@@ -80,7 +90,7 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
     except SimrunError:
         raise
     except Exception as error:  # whatever a foreign policy raises
-        raise PolicyError("resetting a policy", type(policy).__name__, f"{type(error).__name__}: {error}", TRACEBACK) from error
+        raise PolicyError("resetting a policy", type(policy).__name__, raised(error), TRACEBACK) from error
 
 
 def checked_plan(policy: Policy, observation: Observation) -> Plan:
@@ -95,7 +105,7 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
     except SimrunError:
         raise
     except Exception as error:
-        raise PolicyError("querying the policy", name, f"{type(error).__name__}: {error}", TRACEBACK) from error
+        raise PolicyError("querying the policy", name, raised(error), TRACEBACK) from error
     found = plan_problem(plan, observation.t_us)
     if found:
         raise PolicyError("querying the policy", name, found, CHECK)

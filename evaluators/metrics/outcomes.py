@@ -107,7 +107,9 @@ AFTER_S = 3.0  # what has been a cause excuses for so long
 
 
 def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``stalled``, ``braked_without_cause`` and ``left_route`` per step."""
+    """Give ``stalled``, ``braked_without_cause`` and ``left_route`` per step; nothing by AlpaSim's presets, whose metrics are AlpaSim's."""
+    if preset.aliases:
+        return []
     t_us, origin = rollout.ego.t_us, origin_of(rollout.ego_log, preset)
     path = recorded_path(rollout, preset)
     ego = ego_footprints(rollout, preset, origin)

@@ -149,7 +149,12 @@ def _clause(run: Run, point: Point) -> str:
         return f"{point.name} is worse than {baseline} in {_listing(run, point.worse)} and better in {_listing(run, point.better)}"
     if point.tone == "neutral":
         return f"{point.name} drives no worse than {baseline} by more than the margins"
+    if point.text == NO_PAIR:
+        return f"nothing to compare between {point.name} and {baseline}"
     return f"no difference shown between {point.name} and {baseline}"
+
+
+NO_PAIR = "no metric is valid in both members of any pair"
 
 
 def _listing(run: Run, metrics: Sequence[str]) -> str:
@@ -174,7 +179,7 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     parts = [_difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
     parts += [_nothing_seen(run, variant, m, pairs[m]) for m in same]
     text = "; ".join(parts)
-    text = text or "no metric is valid in both members of any pair"
+    text = text or NO_PAIR
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
     baseline = str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
 

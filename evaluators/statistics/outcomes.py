@@ -87,7 +87,8 @@ def sentence(entry: Mapping[str, Any]) -> str:
     if n == 1:
         ends = "reaches the end" if reached else "" if parts else "no event, but the end is not reached"
         return "; ".join([*parts, *([ends] if ends else [])])
-    ends = f"all {n} reach the end" if reached == n else f"{reached} of {n} reach{'es' if reached == 1 else ''} the end"
+    all_of = "both" if n == 2 else f"all {n}"
+    ends = f"{all_of} reach the end" if reached == n else f"{reached} of {n} reach{'es' if reached == 1 else ''} the end"
     return "; ".join([*parts, ends] if parts or reached == n else ["no event", ends])
 
 

@@ -157,3 +157,7 @@ def test_outcomes_are_counted_by_arm_with_place_and_time() -> None:
 
 def test_a_rollout_that_something_else_broke_has_no_outcome() -> None:
     assert outcomes_of(Rollout("r", "p", "s", 0, "failed", "renderer", metrics={"offroad": 1.0})) == frozenset()
+
+
+def test_presets_that_reproduce_alpasim_get_no_metric_that_it_does_not_have() -> None:
+    assert evaluate_outcomes(*drive(track(travelled(slowing()))), PRESETS["alpasim"]) == []

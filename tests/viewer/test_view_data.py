@@ -245,7 +245,7 @@ def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run: Path, tmp
     root = Path(shutil.copytree(watched_run, tmp_path / "run"))
     links = write_flips_page(root)
     assert len(links) == 3
-    for (renderer, policy, scene, seed), link in links.items():
+    for (renderer, policy, scene, seed, _), link in links.items():
         assert link == f"{FLIPS_PAGE}#scene={scene}&policy={policy}&seed={seed}&renderer={renderer}"
     index = documents((root / FLIPS_PAGE).read_text())["index"]
     assert [cell["interest"] for cell in index["cells"]] == ["flip"] * 3

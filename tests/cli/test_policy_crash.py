@@ -1,0 +1,52 @@
+"""A policy that raises: where it did is in the terminal, the traceback in a log that is named, and the check finds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from policies.conformance import check_policy
+
+LATE = """
+from policies.simple import ConstantVelocity
+
+class Late(ConstantVelocity):
+    queries = 0
+
+    def reset(self, seed, route):
+        self.queries = 0
+        super().reset(seed, route)
+
+    def act(self, observation):
+        self.queries += 1
+        return self.lookup([]) if self.queries > 8 else super().act(observation)
+
+    def lookup(self, found):
+        return found[0]
+"""
+
+
+@pytest.fixture
+def late(tmp_path: Path) -> str:
+    path = tmp_path / "late.py"
+    path.write_text(LATE)
+    return f"{path}:Late"
+
+
+def test_the_check_drives_long_enough_to_find_a_policy_that_raises_after_a_while(late: str) -> None:
+    fault, *_ = check_policy(late).failures
+    assert "'long drive' the policy raised IndexError: list index out of range in query 9" in fault
+    assert "late.py:16" in fault
+
+
+def test_the_terminal_has_file_line_and_the_end_of_the_traceback(late: str, tmp_path: Path, capfd) -> None:
+    drive = ["--renderer", "clean", "--policy", late, "--set", "timing.duration_us=2000000", "--certify", "none", "--workers", "1"]
+    assert run_command(["run", *drive, "--out", str(tmp_path / "run"), "smoke/straight"]) == 2
+    said = capfd.readouterr().err
+    assert f"IndexError: list index out of range at {tmp_path}/late.py:16, in lookup" in said
+    assert "return found[0]" in said
+    (log,) = (tmp_path / "run").glob("rollouts/*/*/*/*/output.log")
+    assert f"log {log}" in said
+    assert "IndexError: list index out of range" in log.read_text()
