@@ -84,7 +84,7 @@ def test_lane_lines_are_brighter_than_the_asphalt_beside_them(street: tuple[Scen
         return np.asarray(image[int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)])
 
     for ahead in (10.0, 13.0, 17.0):
-        edge, lane, centre = seen(-7.0, ahead), seen(-1.8, ahead), seen(0.16, ahead)
+        edge, lane, centre = seen(-7.2, ahead), seen(-1.8, ahead), seen(0.16, ahead)
         assert edge.min() > lane.max() + 0.15  # the white line at the right edge
         assert centre[0] > centre[2] + 0.15  # the yellow line between the directions
         assert np.ptp(lane) < 0.06

@@ -307,9 +307,9 @@ def test_content_decides_before_the_suffix(tmp_path: Path, biker: Path) -> None:
 
 
 def test_unknown_form_lists_the_known_ones(tmp_path: Path) -> None:
-    (tmp_path / "a.sog").write_bytes(b"PK\x03\x04....")
+    (tmp_path / "a.gltf").write_bytes(b"PK\x03\x04....")
     with pytest.raises(InputError, match=r"\.ply, \.compressed\.ply, \.splat, \.spz"):
-        read_gaussians(tmp_path / "a.sog")
+        read_gaussians(tmp_path / "a.gltf")
 
 
 def test_missing_file_says_so(tmp_path: Path) -> None:
