@@ -13,6 +13,7 @@ from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run
+from evaluators.report.flips import colours_of
 from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
@@ -312,7 +313,7 @@ def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow
     for rollout in run.rollouts:
         groups.setdefault((rollout.scene, rollout.renderer, rollout.policy), []).append(rollout)
     renderer_index = {name: i for i, name in enumerate(run.renderers)}
-    is_large = len(groups) > MAX_SCENE_ROWS
+    is_large, colours = len(groups) > MAX_SCENE_ROWS, colours_of(run)
     rank = {name: i for i, name in enumerate(interesting if interesting and is_large else run.scenes)}
     keys = sorted(groups, key=lambda k: (rank[k[0]], renderer_index[k[1]], k[2]))
     rows = []
@@ -321,7 +322,7 @@ def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow
         chips = tuple(_chip(run, r) for r in sorted(groups[key], key=lambda r: r.seed))
         collisions, offroad = _count(done, COLLISION), _count(done, ("offroad",))
         values = tuple(_mean(run, done, name) for name in SCENE_METRICS)
-        rows.append(SceneRow(*key, renderer_index[key[1]], chips, collisions, offroad, values))
+        rows.append(SceneRow(*key, colours[key[1], key[2]][0], chips, collisions, offroad, values))
     return rows, len(keys) - len(rows)
 
 
