@@ -42,7 +42,7 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "unknown policy": (["--renderer", "clean", "--policy", "lane-cam", *scene], "did you mean 'lane-camera'"),
         "policy that does not import": (["--policy", "no.such:Thing", *scene], "no.such:Thing"),
         "unknown preset": ([*GOOD, "--preset", "papr", *scene], "known: paper"),
-        "baseline that is not run": ([*GOOD, "--baseline", "3dgs", *scene], "--baseline 3dgs"),
+        "baseline that is not run": ([*GOOD, "--baseline", "3dgs", *scene], "baseline '3dgs'"),
         "bad seeds": ([*GOOD, "--seeds", "a,b", *scene], "--seeds a,b"),
         "no seeds": ([*GOOD, "--seeds", "0", *scene], "--seeds 0"),
         "misspelt verb": (["scroe", "drive.asl"], "simrun score"),

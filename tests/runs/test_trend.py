@@ -158,7 +158,7 @@ def test_the_command_prints_the_steps(
     assert run_command(command) == 0
     out = capsys.readouterr().out
     assert "lateral_distance_m behind onefixer: lane-camera, preset paper" in out
-    assert re.search(r" b +8b07ee4 .* better +weights onefixer.safetensors", out)
+    assert re.search(r" b +8b07ee4 .* undecided +weights onefixer.safetensors", out)
     assert "left out  killed: unfinished" in out
     assert run_command([*command, "--json"]) == 0
     (series,) = json.loads(capsys.readouterr().out)["series"]

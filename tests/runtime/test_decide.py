@@ -197,7 +197,7 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
     assert [look["metrics"] for look in one["looks"]] == [look["metrics"] for look in both["looks"]]
     assert (both["rollouts"], one["rollouts"], one["baseline"]) == (4, 2, f"{GREY} of {tmp_path / 'run'}")
     assert run_command([*alone, "--baseline", "clean"]) == 2
-    assert "no rollout of renderer clean" in capsys.readouterr().out
+    assert "baseline 'clean'" in capsys.readouterr().out
     assert run_command([*alone, "smoke/lead_car"]) == 2
     assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().out
 
@@ -267,7 +267,7 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
     assert run_command([*alone, "--scenes", "smoke/lead_car", "--baseline-file", str(tmp_path / "run")]) == 2
     assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().err
     assert run_command([*words, "--baseline-file", str(tmp_path / "run")]) == 2
-    assert "2 renderers beside a stored baseline" in capsys.readouterr().err
+    assert "renderers and 1 policies beside a stored baseline" in capsys.readouterr().err
     # Of the suite itself, family by family: each file with two seeds.
     suite = tmp_path / "suite.yaml"
     entries = "".join(f"  - {{path: smoke/{name}, seeds: [1, 2]}}\n" for name in ("straight", "curve"))
