@@ -33,7 +33,8 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     whole = aggregate_runs([night / "whole"])
-    assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"  # all six scenes differ by exactly 0.4 m: no spread to go by
+    # All six scenes differ by exactly 0.4 m: there is no spread to go by.
+    assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"
     out = tmp_path / "night.json"
     assert run_command(["aggregate", str(night / "part-1"), str(night / "part-2"), "--json", "--out", str(out)]) == 0
     parts = json.loads(capsys.readouterr().out)
