@@ -33,7 +33,9 @@ def test_a_verb_on_a_machine_that_lacks_something_ends_as_documented(root: Path,
 
 
 @as_root
-@pytest.mark.parametrize("named", ["closed", "closed/deep", "closed/deep/scene.yaml", "scene.yaml"])
+@pytest.mark.parametrize(
+    "named", ["closed/deep", *(pytest.param(name, marks=pytest.mark.slow) for name in ("closed", "closed/deep/scene.yaml", "scene.yaml"))]
+)
 def test_a_scenario_that_may_not_be_read_is_an_error_with_four_parts(named: str) -> None:
     with shared_folder() as folder:
         text = (REPO / "scenarios" / "smoke" / "straight.yaml").read_text()

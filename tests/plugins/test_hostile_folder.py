@@ -73,7 +73,8 @@ MORE = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("commands", [QUICK, pytest.param(MORE, marks=pytest.mark.slow)], ids=["quick", "more"])
+@pytest.mark.slow  # `test_ways_to_run_code` tries the same folder in a few seconds
+@pytest.mark.parametrize("commands", [QUICK, MORE], ids=["quick", "more"])
 def test_no_command_runs_what_lies_in_the_working_directory(hostile: Path, commands: Sequence[list[str]]) -> None:
     first = simrun(hostile, *DRIVE, "--workers", "2", "--out", "one", "smoke/straight")
     assert first.returncode == 0, first.stderr
