@@ -12,7 +12,8 @@ from tests.degradation.cells import DRIVE, MACHINES, REPO, make_work, outcome
 from tests.other_user import as_root, run_as_nobody, shared_folder
 
 CELLS = (
-    ("no home", "compare", 0), ("read-only", "run", 4), ("nothing", "report", 4), ("full disk", "run", 4), ("hostile run", "check", 1),
+    ("no home", "compare", 0), ("read-only", "run", 4), ("hostile run", "check", 1),
+    pytest.param("nothing", "report", 4, marks=pytest.mark.slow), pytest.param("full disk", "run", 4, marks=pytest.mark.slow),
 )  # fmt: skip
 
 

@@ -208,7 +208,7 @@ def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path: Path) -> None:
     assert (tmp_path / "next" / "fixer-000001.safetensors").is_file()
     wide = fixer_settings("onefixer", (*SMALL, "generator.detail=12"))
     assert isinstance(wide, PixelFixerSettings)
-    with pytest.raises(InputError, match="another shape of: .*read.weight"):
+    with pytest.raises(InputError, match=r"another shape of: .*read\.weight"):
         train_per_frame(replace(run_of(init=begin), settings=wide), tmp_path / "wide", None)
 
 
