@@ -25,6 +25,7 @@ def root() -> Iterator[Path]:
         yield folder
 
 
+@pytest.mark.slow
 @as_root
 @pytest.mark.parametrize(("machine", "verb", "code"), CELLS)
 def test_a_verb_on_a_machine_that_lacks_something_ends_as_documented(root: Path, machine: str, verb: str, code: int) -> None:

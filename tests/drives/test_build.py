@@ -80,6 +80,7 @@ def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path: Path
     assert load_scenario(tmp_path / "out/scenario.yaml").model
 
 
+@pytest.mark.slow
 def test_scale_without_metres_comes_from_the_cameras_height(tmp_path: Path, quick_fit: None) -> None:
     folder = write_transforms(tmp_path / "walk")
     document = json.loads((folder / "transforms.json").read_text())
@@ -110,6 +111,7 @@ XODR = """<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/><ro
 <width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right></laneSection></lanes></road></OpenDRIVE>"""
 
 
+@pytest.mark.slow
 def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(tmp_path: Path, quick_fit: None) -> None:
     folder = write_transforms(tmp_path / "walk", unit="m")
     (tmp_path / "here.xodr").write_text(XODR.format(x=-10, y=1.75))

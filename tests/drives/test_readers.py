@@ -76,6 +76,7 @@ def test_photographs_are_freed_of_every_lens(tmp_path: Path, model: str, bend: t
     assert np.abs(straight.rgb()[inner].astype(float) - bent.rgb()[inner]).mean() > 2 * off
 
 
+@pytest.mark.slow
 def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "sequences/07")
     for old, new in (("image_l", "image_2"), ("image_r", "image_3")):

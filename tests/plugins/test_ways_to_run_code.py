@@ -197,7 +197,7 @@ WAYS: dict[str, Way] = {
     "words that a shell would run": shells,
     "programs beside the command": programs,
 }  # fmt: skip
-QUICK = ("distribution metadata and entry points", "weights")
+QUICK = ("distribution metadata and entry points",)
 
 
 @pytest.fixture(scope="module")

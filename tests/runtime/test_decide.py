@@ -242,6 +242,7 @@ def test_questions_that_cannot_be_asked_are_refused(more, found, tmp_path: Path,
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> None:
     gate = tmp_path / "gate.yaml"
     gate.write_text(
