@@ -1,0 +1,57 @@
+"""A server gives its fixer the recorded frames of a scene, and equal requests the same ones whatever was asked before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry, resolve_served
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.types import RenderRequest
+
+SCENE = """
+version: 1
+scene_id: served
+road: {segments: [{kind: straight, length_m: 120}]}
+ego: {speed_mps: 10}
+timing: {duration_us: 2_000_000}
+cameras: [{width: 64, height: 48}]
+environment: {buildings: 0.0, trees_per_100m: 0.0, poles_spacing_m: 0}
+degradation: {kind: surrogate}
+"""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("served") / "served.yaml"
+    path.write_text(SCENE)
+    return path
+
+
+def served(file: Path, renderer: str) -> SceneEntry:
+    return SceneCache([file], resolve_served(renderer), False, threads=1).get("served")
+
+
+def request(entry: SceneEntry, t_us: int) -> RenderRequest:
+    scenario = entry.scenario
+    camera = scenario.cameras[0]
+    pose = interpolate(scenario.ego_log, scenario.start_us + t_us) @ camera.T_rig_camera
+    return RenderRequest(scenario.start_us + t_us, camera, np.stack([pose, pose]), {})
+
+
+def test_a_view_has_the_same_references_whatever_was_asked_before(file: Path) -> None:
+    entry = served(file, "onefixer")
+    alone = entry.render(request(entry, 820_000)).references
+    entry.render(request(entry, 1_500_000))
+    again = entry.render(request(entry, 820_000)).references
+    assert len(alone) == 2
+    assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
+    assert (alone[0][..., 3] > 0).mean() > 0.5
+
+
+def test_a_fixer_that_reads_none_is_given_none(file: Path) -> None:
+    entry = served(file, "onefixer[references=0]")
+    assert entry.references is None
+    assert entry.render(request(entry, 820_000)).references == ()
