@@ -128,6 +128,7 @@ def test_times_put_photographs_in_order(tmp_path: Path) -> None:
     assert drive.metric == "the file's word that its unit is the metre"
 
 
+@pytest.mark.slow
 def test_a_real_rig_becomes_a_scenario_with_its_tracks(shared_data: Path, tmp_path: Path, quick_fit: None) -> None:
     from alpasim_plugin.drives.build import import_drive
     from scenarios.load import load_scenario
