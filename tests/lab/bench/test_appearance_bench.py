@@ -21,6 +21,8 @@ from alpasim_plugin.lab.training.pair_store import PairSequence
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.corner import make_corner
 
+pytestmark = pytest.mark.slow  # pictures of a study that no drive needs
+
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AppearanceRun:

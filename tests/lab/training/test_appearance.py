@@ -34,6 +34,8 @@ from tests.block_fixers.fixer_cases import run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.corner import make_corner
 
+pytestmark = pytest.mark.slow  # pictures of a study that no drive needs
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -14,6 +14,8 @@ from alpasim_plugin.lab.interiors.places import FAMILIES, build_place
 from alpasim_plugin.lab.interiors.shadow_kernels import nearest, reached
 from alpasim_plugin.lab.interiors.surfaces import Block, Panel, Turned, block, upright
 
+pytestmark = pytest.mark.slow  # pictures of a study that no drive needs
+
 COARSE = 6.0
 
 
