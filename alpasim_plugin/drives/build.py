@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -93,21 +94,30 @@ def import_drive(
         InfrastructureError: The disk refuses.
     """
     tell = report or (lambda stage, done, all: None)
-    found = out.with_name(f".{out.name}.poses")
-    work = out.with_name(f".{out.name}.unfinished")
-    try:
+    with working_folders(out) as (found, work):
         drive = checked(read_source(folder, found, tell), folder)
         key = key_of(drive, camera_height_m, lane_map)
         if out.exists():
             return finished(out, key)
-        quality = _built(drive, folder, work, key, camera_height_m, lane_map, tell)
-    except InputError:  # it would be the same again: nothing is kept to go on from
+        return _built(drive, folder, work, key, camera_height_m, lane_map, tell)
+
+
+@contextmanager
+def working_folders(out: Path) -> Iterator[tuple[Path, Path]]:
+    """Give the folders for poses that are found and for the unfinished scenario, which becomes ``out`` at the end.
+
+    After an `InputError`, which would come again, both are removed; after an interruption they are kept to go on from.
+    """
+    found, work = out.with_name(f".{out.name}.poses"), out.with_name(f".{out.name}.unfinished")
+    try:
+        yield found, work
+    except InputError:
         forget(found)
         forget(work)
         raise
-    work.replace(out)
+    if not out.exists():
+        work.replace(out)
     forget(found)
-    return quality
 
 
 def _built(

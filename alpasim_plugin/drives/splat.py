@@ -12,10 +12,18 @@ import scipy
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.drives.build import Report, begin, finished, key_of, shown_photographs, write_folder, write_photographs
+from alpasim_plugin.drives.build import (
+    Report,
+    begin,
+    finished,
+    key_of,
+    shown_photographs,
+    working_folders,
+    write_folder,
+    write_photographs,
+)
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
-from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -48,8 +56,7 @@ def import_splat(file: Path, poses: Path, out: Path, report: Report | None = Non
         InputError: The model or the poses cannot be used, or do not lie in one frame; nothing is left behind then.
     """
     tell = report or (lambda stage, done, all: None)
-    found, work = out.with_name(f".{out.name}.poses"), out.with_name(f".{out.name}.unfinished")
-    try:
+    with working_folders(out) as (found, work):
         drive = read_source(poses.parent if poses.name == "transforms.json" else poses, found, tell, photographs=False)
         has_photographs = all(one.file.is_file() for one in drive.pictures)
         drive = checked(drive, poses, has_photographs)
@@ -62,14 +69,7 @@ def import_splat(file: Path, poses: Path, out: Path, report: Report | None = Non
             return finished(out, key)
         note = f"the model is {file.name}: {kept}" if kept.n_kept < kept.n_input else f"the model is {file.name}: {kept.n_kept} Gaussians"
         drive = replace(drive, scene_id=file.stem.split(".")[0], points=_surface(cloud), notes=(*drive.notes, note))
-        quality = _built(drive, cloud, file, work, key, has_photographs, tell)
-    except InputError:
-        forget(found)
-        forget(work)
-        raise
-    work.replace(out)
-    forget(found)
-    return quality
+        return _built(drive, cloud, file, work, key, has_photographs, tell)
 
 
 def _surface(cloud: GaussianCloud) -> Points:

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.pixel_settings import FrameByFrameSettings
-from alpasim_plugin.fixers.warp import HELD
+from alpasim_plugin.fixers.warp import VALID
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
@@ -47,6 +47,6 @@ class NearestFixer(Fixer):
         """Fix one frame; there is no past."""
         rgb = frame.rgb.copy()
         for image in reversed(frame.references):
-            held = image[..., 3] == HELD
+            held = image[..., 3] == VALID
             rgb[held] = image[held, :3]
         return replace(frame, rgb=rgb, references=()), None

@@ -230,7 +230,9 @@ def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:
     sdmap = torch.full_like(render, -1.0) if view.maps is None else image(view.maps[:, 0]).float().div_(HALF).sub_(1)
     references = None
     if view.references is not None:
-        padded = np.pad(view.references[:, 0], ((0, 0), (0, 0), (0, below), (0, right), (0, 0)))
+        padded = view.references[:, 0]
+        if right or below:
+            padded = np.pad(padded, ((0, 0), (0, 0), (0, below), (0, right), (0, 0)))
         references = torch.from_numpy(padded).to(device).float().mul_(1 / HALF).sub_(1)
         references[..., 3:].add_(1).mul_(0.5)
     return PixelInputs(render, opacity, sdmap, references)

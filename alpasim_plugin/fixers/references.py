@@ -2,7 +2,7 @@
 
 Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph, carried into the view by the render's
 own depth and by the poses that the reconstruction believes; pixels of a road user move with its box. Both are as wrong as the
-reconstruction is, so a fixer is told where a reference holds and decides by itself what to take of it.
+reconstruction is, so each reference comes with a validity mask, and the fixer learns how much of it to use.
 
 A recording is known in full before a rollout begins: frames that were recorded after the present time are references as well, unless
 ``past`` asks for earlier ones alone. Nothing of the rollout's own future is looked at.
@@ -73,8 +73,8 @@ class ReferenceSession:
         actors: The scenario's, for the sizes of their boxes.
         count: References of a frame, at most.
         which: ``all`` of the recording, or only what was recorded before the frame's time.
-        holds_on: Whether a camera keeps its references a little longer than they are nearest. Without it a view's references do not depend
-            on what came before, as a server of several drives needs.
+        hysteresis: Whether a camera keeps its references a little longer than they are nearest. Without it the references of a view do not
+            depend on what came before, as a server of several drives needs.
     """
 
     def __init__(
@@ -83,9 +83,9 @@ class ReferenceSession:
         actors: Sequence[Actor],
         count: int,
         which: Literal["all", "past"] = "all",
-        holds_on: bool = True,
+        hysteresis: bool = True,
     ) -> None:
-        self.index, self.count, self.past, self.holds_on = ReferenceIndex(recorded), count, which == "past", holds_on
+        self.index, self.count, self.past, self.hysteresis = ReferenceIndex(recorded), count, which == "past", hysteresis
         self._boxes = {actor.actor_id: actor.box for actor in actors}
         self._last: dict[str, tuple[int, ...]] = {}
         self._pictures: OrderedDict[int, Picture] = OrderedDict()
@@ -102,7 +102,7 @@ class ReferenceSession:
         T_world_camera = request.T_world_camera[-1]
         last = self._last.get(frame.camera, ())
         chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
-        if self.holds_on:
+        if self.hysteresis:
             self._last[frame.camera] = chosen
         target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors)
         return tuple(warp(self._picture(i), target, self._boxes) for i in chosen)

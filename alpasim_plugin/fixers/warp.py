@@ -20,7 +20,7 @@ NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, 
 SLACK, SLACK_M = 0.12, 0.4  # two depths agree within this share and this length: reconstructions are no better
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
-HELD, DOUBTED = 255, 128  # last channel of a reference: the recorded frame shows this surface; it shows the place, at another depth
+VALID, INCONSISTENT = 255, 128  # last channel of a reference: validity: the depths agree; they do not
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +63,9 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
         boxes: Sizes of the actors.
 
     Returns:
-        ``(H, W, 4)`` uint8: colour, and `HELD` where the recorded frame's own depth agrees with the point, `DOUBTED` where it does not
-        (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to an
-        actor that was not there.
+        ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with the point, `INCONSISTENT` where it does
+        not (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to
+        an actor that was not there.
     """
     now = [name for name in sorted(target.actors) if name in boxes]
     absent = np.full((4, 4), np.nan)
@@ -97,7 +97,7 @@ def warp_coordinates(
         sizes: ``(A, 3)`` length, width and height, metres.
 
     Returns:
-        Column and row ``(H, W)``, counted from the centre of the first pixel, and `HELD`, `DOUBTED` or 0 ``(H, W)``.
+        Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`, `INCONSISTENT` or 0 ``(H, W)``.
     """
     height, width = depth.shape
     x, y, held = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
@@ -153,7 +153,7 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
             there = np.float64(depth_then[int(v), int(u)])
             there = there if there > 0 else np.float64(INFINITY_M)
             far = there > INFINITY_M / 2 and rz > INFINITY_M / 2
-            held[row, column] = HELD if far or abs(there - rz) < SLACK * rz + SLACK_M else DOUBTED
+            held[row, column] = VALID if far or abs(there - rz) < SLACK * rz + SLACK_M else INCONSISTENT
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -200,7 +200,7 @@ def plain_coordinates(
     then = np.where(at > 0, at, INFINITY_M)
     far = (then > INFINITY_M / 2) & (rz > INFINITY_M / 2)
     agrees = far | (np.abs(then - rz) < SLACK * rz + SLACK_M)
-    held = np.where(seen, np.where(agrees, HELD, DOUBTED), 0).astype(np.uint8)
+    held = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0).astype(np.uint8)
     return np.where(seen, x - 0.5, 0).astype(np.float32), np.where(seen, y - 0.5, 0).astype(np.float32), held
 
 

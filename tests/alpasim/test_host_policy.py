@@ -92,7 +92,7 @@ def is_served(host: Host, name: str, **options: Any) -> bool:
 
 
 class Silence:
-    """Messages of a caller that sends none until it is told to end."""
+    """The request stream of a caller that stays silent and then closes."""
 
     def __init__(self) -> None:
         self.over = threading.Event()

@@ -93,7 +93,7 @@ def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_drive
 
 
 class Answering:
-    """A driver that fails as it is told."""
+    """A driver that fails with a given status."""
 
     def __init__(self, code: Any, text: str = "as told") -> None:
         self.code, self.text = code, text

@@ -96,7 +96,7 @@ def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
 def test_the_facts_of_a_real_street(shared_data: Path) -> None:
     folder = shared_data / "kitti-street"
     if not folder.is_dir():
-        pytest.skip("the street is not here")
+        pytest.skip(f"{folder} is absent")
     drive = checked(read_source(folder, folder / "nowhere", told), folder)
     assert (len(drive.of("left")), len(drive.of("right"))) == (51, 51)
     across = np.linalg.inv(drive.of("left")[9].T_world_camera) @ drive.of("right")[9].T_world_camera
@@ -106,7 +106,7 @@ def test_the_facts_of_a_real_street(shared_data: Path) -> None:
 def test_the_facts_of_a_real_rig(shared_data: Path) -> None:
     folder = shared_data / "dgp"
     if not folder.is_dir():
-        pytest.skip("the rig is not here")
+        pytest.skip(f"{folder} is absent")
     drive = checked(read_source(folder, folder / "nowhere", told), folder)
     assert (drive.front, len(drive.cameras), len(drive.pictures), len(drive.tracks)) == ("CAMERA_01", 6, 18, 9)
     assert drive.points is not None
@@ -134,7 +134,7 @@ def test_a_real_rig_becomes_a_scenario_with_its_tracks(shared_data: Path, tmp_pa
     from scenarios.load import load_scenario
 
     if not (shared_data / "dgp").is_dir():
-        pytest.skip("the rig is not here")
+        pytest.skip("the DGP scene is absent from the shared data")
     import_drive(shared_data / "dgp", tmp_path / "out")
     scenario = load_scenario(tmp_path / "out/scenario.yaml")
     tracked = [actor for actor in scenario.actors if not actor.actor_id.startswith("obstacle-")]

@@ -8,7 +8,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.warp import DOUBTED, HELD
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID
 
 
 def reference(grey: int, holds: list[int]) -> np.ndarray:
@@ -19,7 +19,7 @@ def reference(grey: int, holds: list[int]) -> np.ndarray:
 
 def test_the_nearest_lies_on_top_and_what_is_doubted_is_not_shown() -> None:
     fixer = make_fixer("nearest", scene_id="s")
-    references = (reference(1, [HELD, 0, 0, DOUBTED]), reference(2, [HELD, HELD, 0, DOUBTED]))
+    references = (reference(1, [VALID, 0, 0, INCONSISTENT]), reference(2, [VALID, VALID, 0, INCONSISTENT]))
     (out,) = fixer.step([Frame(0, "front", np.full((1, 4, 3), 9, np.uint8), references=references)], [])
     assert out.rgb[0, :, 0].tolist() == [1, 2, 9, 9]
     assert out.references == ()

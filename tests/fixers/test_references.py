@@ -10,7 +10,7 @@ import pytest
 from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.types import F32, F64, U8, Actor, Box, CameraSpec, Frame, RecordedFrame, RenderRequest, Trajectory
 from alpasim_plugin.fixers.references import ReferenceIndex, ReferenceSession
-from alpasim_plugin.fixers.warp import DOUBTED, HELD, Picture, WarpTarget, plain_coordinates, warp, warp_coordinates
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, plain_coordinates, warp, warp_coordinates
 
 WIDTH, HEIGHT = 64, 32
 K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
@@ -42,7 +42,7 @@ def test_a_frame_warped_into_its_own_view_is_itself() -> None:
     depth[:8] = 0  # sky
     one = picture(at(3.0, 1.0, 0.3), depth)
     out = warp(one, WarpTarget(K, one.T_world_camera, depth, {}), {})
-    assert (out[..., 3] == HELD).all()
+    assert (out[..., 3] == VALID).all()
     assert np.abs(out[..., :3].astype(int) - one.rgb).max() <= 1
 
 
@@ -52,7 +52,7 @@ def test_a_wall_seen_from_nearer_is_larger() -> None:
     # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
     expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
     assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
-    assert (out[..., 3] == HELD).all()
+    assert (out[..., 3] == VALID).all()
 
 
 def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_there() -> None:
@@ -60,11 +60,11 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
     seen, depth = wall(20.0, here), wall(20.0, here)
     seen[:, 20:40] = 5.0  # a post hid the wall when the frame was recorded
     out = warp(picture(here, seen), WarpTarget(K, here, depth, {}), {})
-    assert (out[:, 20:40, 3] == DOUBTED).all()
-    assert (out[:, :20, 3] == HELD).all()
+    assert (out[:, 20:40, 3] == INCONSISTENT).all()
+    assert (out[:, :20, 3] == VALID).all()
     aside = warp(picture(here, depth), WarpTarget(K, at(0.0, 12.0), depth, {}), {})  # 12 m to the left: 24 px at 20 m
     assert (aside[:, :24, 3] == 0).all()
-    assert (aside[:, 24:, 3] == HELD).all()
+    assert (aside[:, 24:, 3] == VALID).all()
 
 
 def test_nothing_but_the_rotation_moves_the_sky() -> None:
@@ -87,7 +87,7 @@ def test_a_car_is_looked_up_where_it_was() -> None:
     out = warp(picture(here, before, columns(), {"car": then}), WarpTarget(K, here, depth, {"car": now}), {"car": box})
     middle = 32 - 40 * 3.0 / 12.0  # 3 m to the left at 12 m
     assert out[17, 31:33, 0].mean() == pytest.approx(4 * (middle - 0.5), abs=4)
-    assert (out[rows, car, 3] == HELD).all()
+    assert (out[rows, car, 3] == VALID).all()
     gone = warp(picture(here, before, columns()), WarpTarget(K, here, depth, {"car": now}), {"car": box})
     assert (gone[rows, car, 3] == 0).all()
 
@@ -148,7 +148,7 @@ def test_only_earlier_frames_are_references_where_the_past_is_asked_for() -> Non
     assert index.choose(at(6.0), 0, 3, past=True) == ()
 
 
-def session(which: str = "all", holds_on: bool = True) -> tuple[ReferenceSession, list[int]]:
+def session(which: str = "all", hysteresis: bool = True) -> tuple[ReferenceSession, list[int]]:
     reads: list[int] = []
 
     def read() -> tuple[U8, F32]:
@@ -157,7 +157,7 @@ def session(which: str = "all", holds_on: bool = True) -> tuple[ReferenceSession
 
     car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
     frames = recorded([(float(x), 0.0) for x in range(0, 60, 2)], step_us=100_000, read=read)
-    return ReferenceSession(frames, [car], 2, which, holds_on), reads  # type: ignore[arg-type]
+    return ReferenceSession(frames, [car], 2, which, hysteresis), reads  # type: ignore[arg-type]
 
 
 def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
@@ -181,7 +181,7 @@ def test_a_frame_without_depth_has_no_references() -> None:
 
 
 def test_without_memory_the_same_view_has_the_same_references_whatever_came_before() -> None:
-    found, _ = session(holds_on=False)
+    found, _ = session(hysteresis=False)
     alone = found.of(*request(10.9, 500_000))
     found.of(*request(40.0, 2_000_000))
     again = found.of(*request(10.9, 500_000))

@@ -82,7 +82,7 @@ def test_a_model_comes_back(tmp_path: Path, zipped: bool) -> None:
 def test_three_levels_of_a_real_model_agree(shared_data: Path) -> None:
     folder = shared_data / "gaussians/playbot"
     if not folder.is_dir():
-        pytest.skip("the model is not here")
+        pytest.skip(f"{folder} is absent")
     clouds = [read_gaussians(folder / level)[0] for level in ("4_0", "5_0", "6_0")]
     assert [len(cloud) for cloud in clouds] == [8406, 3000, 1873]
     for cloud in clouds[1:]:

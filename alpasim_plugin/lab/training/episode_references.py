@@ -16,7 +16,7 @@ import numpy as np
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, U8, Box
 from alpasim_plugin.fixers.references import ReferenceIndex
-from alpasim_plugin.fixers.warp import DOUBTED, HELD, Picture, warp
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, warp
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 
@@ -113,7 +113,7 @@ def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
     at = at if bent is None else at + bent
     out = np.empty((height, width, 4), np.uint8)
     out[..., :3] = cv2.remap(np.ascontiguousarray(there), at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    out[..., 3] = np.where(seen, np.where(agrees, HELD, DOUBTED), 0)
+    out[..., 3] = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0)
     return out
 
 

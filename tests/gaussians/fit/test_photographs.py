@@ -115,7 +115,7 @@ def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> Non
 def test_the_facts_of_a_real_set(shared_data: Path) -> None:
     folder = shared_data / "fox"
     if not folder.is_dir():
-        pytest.skip("the photographs are not here")
+        pytest.skip(f"{folder} is absent")
     found = read_photographs(folder, 64)
     assert (len(found.views), found.listed, len(found.missing)) == (50, 67, 17)
     assert found.missing[:4] == ("images/0005.jpg", "images/0016.jpg", "images/0017.jpg", "images/0024.jpg")

@@ -11,7 +11,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Degradation, Environment, Scenario
-from alpasim_plugin.fixers.warp import HELD
+from alpasim_plugin.fixers.warp import VALID
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.pairs import MOVING_M, PairRecipe, lateral_offsets, make_sequence
 from alpasim_plugin.lab.training.reference_store import open_references
@@ -88,7 +88,7 @@ def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_vi
     assert recorded.t_us.tolist() == sequence.clip.t_us.tolist()
     assert recorded.rgb_t_us.tolist() == [50_000, 550_000]
     for i, (image,) in enumerate(recorded.warped(len(sequence.clip), 1)):
-        held = image[..., 3] == HELD
+        held = image[..., 3] == VALID
         assert held.mean() > 0.5
         error = np.abs(image[..., :3].astype(float) - sequence.clip.rgb_gt[i]).mean(axis=-1)
         assert np.median(error[held]) < 3  # the same surfaces, seen from beside
