@@ -17,7 +17,7 @@ from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
-from evaluators.metrics.route import DIRECTION_M, beside, recorded_path, to_path
+from evaluators.metrics.route import DIRECTION_M, followed, on_route, recorded_path, to_path
 from evaluators.metrics.score import handover_us, series, with_preset
 
 if TYPE_CHECKING:
@@ -114,8 +114,8 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     path = recorded_path(rollout, preset)
     ego = ego_footprints(rollout, preset, origin)
     line = path.xyz[:, :2] - origin[:2]
-    distance_m, s = to_path(line, ego.xy)
-    aside_m = beside(line, s, ego.xy, distance_m)
+    aside_m = on_route(line, path.t_us, t_us, ego.xy).aside_m
+    s = followed(line, to_path(line, ego.xy)[1], ego.xy, float(np.interp(t_us[0], path.t_us, arc_lengths(line))))
     has_side = np.isfinite(aside_m)
     why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     stalled, braked = _slow(rollout, preset, line, path.t_us, s)

@@ -1,6 +1,8 @@
 """The drive against the recorded one: distance from its path, from its position at the time, and progress along it.
 
-Beyond the ends of that path the lateral distance is measured from its straight continuation: driving on is no error.
+Beyond the ends of that path the lateral distance is measured from its straight continuation: driving on is no error. Where the recorded
+car stands at an end, what its position does there is noise and no path. Progress moves along the path with the ego: where the path comes
+back beside itself, the nearest point of the whole path may be one that is still a long way ahead.
 
 The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved to the box centre with the log's
 rig-to-box pose. All distances are in plan view. The paper's route distance is the mean over the scored steps of the distance to that path.
@@ -8,7 +10,7 @@ rig-to-box pose. All distances are in plan view. The paper's route distance is t
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -20,6 +22,7 @@ from evaluators.metrics.presets import PRESETS, Preset
 from evaluators.metrics.score import relevant, series, with_preset
 
 DIRECTION_M = 1.0
+STAND_M = 0.5  # what a recording does within this distance of its first or last position is standing there
 _ROWS = 32  # points handled at once, so that what is computed of them stays in the processor's cache
 
 
@@ -42,6 +45,43 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
     line = shapely.linestrings(np.repeat(path, 2, axis=0) if len(path) == 1 else path)
     at = shapely.points(points)
     return np.asarray(shapely.distance(line, at)), np.asarray(shapely.line_locate_point(line, at))
+
+
+def moving(path: F64) -> I64:
+    """Return which vertices of a path ``(N, 2)`` remain when it stands at neither end: the ends, and what lies beyond `STAND_M` from them."""
+    away = [np.hypot(*(path - end).T) > STAND_M for end in (path[0], path[-1])]
+    if not (away[0].any() and away[1].any()):
+        return np.zeros(1, dtype=np.int64)
+    first, last = int(np.argmax(away[0])), len(path) - 1 - int(np.argmax(away[1][::-1]))
+    return np.concatenate([[0], np.arange(first, last + 1), [len(path) - 1]])
+
+
+def followed(path: F64, s: F64, points: F64, first_m: float) -> F64:
+    """Return ``(T,)`` arc lengths on a path that move no farther from step to step than points that move beside it.
+
+    Args:
+        path: ``(N, 2)`` vertices.
+        s: ``(T,)`` arc length of the nearest point of the whole path.
+        points: ``(T, 2)``.
+        first_m: Arc length about which the first one is sought.
+
+    Each is the nearest point of the path within 2 m, and twice what the point has moved, of the one before.
+    """
+    at = arc_lengths(path)
+    out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
+    reach_m[0] += 2.0 * float(np.hypot(*(points[0] - _at(path, at, first_m))))
+    leaps = np.flatnonzero(np.abs(np.diff(s, prepend=first_m)) > reach_m)
+    for k in range(int(leaps[0]), len(s)) if len(leaps) else ():
+        before = float(out[k - 1]) if k else first_m
+        low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(at[-1]))
+        inner = path[np.searchsorted(at, low, "right") : np.searchsorted(at, high)]
+        out[k] = low + to_path(np.concatenate([_at(path, at, low)[None], inner, _at(path, at, high)[None]]), points[[k]])[1][0]
+    return out
+
+
+def _at(path: F64, along: F64, s: float) -> F64:
+    """Return the point ``(2,)`` of a path at an arc length."""
+    return np.array([np.interp(s, along, path[:, axis]) for axis in (0, 1)])
 
 
 def left_of(path: F64, s: F64, points: F64) -> F64:
@@ -74,17 +114,16 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
         points: ``(T, 2)``.
         distance_m: ``(T,)`` distance from the path itself.
 
-    The direction at an end is that of the path's last `DIRECTION_M` metres: a recording that stops leaves vertices too near for one.
+    The direction at an end is that of the path's last `DIRECTION_M` metres. A path that stands at an end is cut by `moving` first.
     """
     at = arc_lengths(path)
     length_m = float(at[-1])
     if length_m < DIRECTION_M:
         return np.full(len(points), np.nan)
     out = np.array(distance_m)
-    inner = (np.interp(DIRECTION_M, at, path[:, 0]), np.interp(DIRECTION_M, at, path[:, 1]))
-    outer = tuple(np.interp(length_m - DIRECTION_M, at, path[:, axis]) for axis in (0, 1))
+    inner, outer = _at(path, at, DIRECTION_M), _at(path, at, length_m - DIRECTION_M)
     for end, inside, is_there in ((path[0], inner, s <= 0.0), (path[-1], outer, s >= length_m * (1 - 1e-12))):
-        away = end - np.asarray(inside)
+        away = end - inside
         away = away / np.hypot(*away)
         offset = points - end
         beyond = is_there & (offset @ away > 0.0)
@@ -140,6 +179,33 @@ def progress_so_far(path: F64, points: F64) -> F64:
     return out
 
 
+@dataclass(frozen=True)
+class OnRoute:
+    """Where points are against the recorded drive, which stands at neither end.
+
+    Attributes:
+        length_m: Length of the path.
+        along_m: ``(T,)`` how far along it, continuous from step to step.
+        aside_m: ``(T,)`` how far beside it, NaN where it has no direction; it goes straight on at both ends.
+        side: ``(T,)`` as `left_of`.
+    """
+
+    length_m: float
+    along_m: F64
+    aside_m: F64
+    side: F64
+
+
+def on_route(path: F64, recorded_us: I64, t_us: I64, points: F64) -> OnRoute:
+    """Set points ``(T, 2)`` at times ``(T,)`` beside a recorded path ``(N, 2)`` with times ``(N,)``."""
+    keep = moving(path)
+    line = path[keep]
+    along = arc_lengths(line)
+    distance_m, s = to_path(line, points)
+    followed_m = followed(line, s, points, float(np.interp(t_us[0], recorded_us[keep], along)))
+    return OnRoute(float(along[-1]), followed_m, beside(line, s, points, distance_m), left_of(line, s, points))
+
+
 def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> list[MetricSeries]:
     """Give the recording-based metrics and ``eval_relevant`` per step."""
     t_us = rollout.ego.t_us
@@ -152,7 +218,9 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
     there = held(interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3], preset)[:, :2] - origin[:2]
     away_m = np.hypot(*(ego - there).T)
-    share = s / length_m if length_m > 0 else np.full(len(s), np.nan)
+    on = None if preset.aliases else on_route(path, recorded.t_us, t_us, ego)
+    share, of_m = (s, length_m) if on is None else (on.along_m, on.length_m)
+    share = share / of_m if of_m > 0 else np.full(len(s), np.nan)
     no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     no_length = "the recorded path has no length"
     outside = "the recording does not cover this time"
@@ -172,13 +240,13 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     out = [
         series("dist_to_gt_trajectory", t_us, distance_m),
         series("dist_to_gt_location", t_us, away_m, covered, outside),
-        series("progress", t_us, share, length_m > 0, no_length),
+        series("progress", t_us, share, of_m > 0, no_length),
         series("progress_rel", t_us, so_far, covered, outside),
         series("dist_traveled_m", t_us, traveled_m),
         series("gt_dist_traveled_m", t_us, np.full(len(t_us), length_m)),
         series("eval_relevant", t_us, engaged),
     ]
-    if preset.aliases:
+    if on is None:
         if aside_m is not None and preset.stop_beyond_gt_m is not None:
             out.append(series("lateral_dist_to_gt_trajectory", t_us, aside_m))
             out.append(series("left_corridor_laterally", t_us, aside_m >= preset.stop_beyond_gt_m))
@@ -186,13 +254,12 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
             reached_m = float(to_path(path, there[-1:])[1][0])
             share = share * (length_m / reached_m if reached_m > 0 else 1.0)
         return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
-    aside_m = beside(path, s, ego, distance_m)
-    has_side = np.isfinite(aside_m)
+    has_side = np.isfinite(on.aside_m)
     return [
         *out,
-        series("lateral_distance_m", t_us, aside_m, has_side, no_direction),
+        series("lateral_distance_m", t_us, on.aside_m, has_side, no_direction),
         series("route_distance_m", t_us, distance_m),
-        series("lateral_bias_m", t_us, left_of(path, s, ego) * aside_m, has_side, no_direction),
+        series("lateral_bias_m", t_us, on.side * on.aside_m, has_side, no_direction),
     ]
 
 

@@ -8,12 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
+from alpasim_plugin.core.geometry import arc_lengths, interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.core.types import F64, RolloutLog
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import PRESETS, Preset
 from evaluators.metrics.reference import actor_corners, exact, point_to_segment, sides_of, touch
-from evaluators.metrics.route import recorded_path
+from evaluators.metrics.route import moving, recorded_path
 
 
 def convex_contains(ring: F64, body: F64) -> bool:
@@ -44,26 +44,31 @@ def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
     recorded = recorded_path(rollout, PRESETS["paper"])
     path = recorded.xyz[:, :2]
     there = interpolate(recorded, rollout.ego.t_us)[:, :2, 3]
-    out = []
+    line, out = path[moving(path)], []
+    s, before = float(np.interp(rollout.ego.t_us[0], recorded.t_us[moving(path)], arc_lengths(line))), there[0]
     for i in range(len(rollout.ego)):
         point = rollout.ego.xyz[i, :2]
-        distance_m, s, length = _along(path, point)
+        distance_m, _, _ = _along(path, point)
+        _, s, length = _along(line, point, s, 2 + 2 * math.dist(point, before))
+        before = point
         _, s_rel, length_rel = _along(there[: i + 1], point)
         rel = s_rel / length_rel if length_rel > 0 else 1.0
         out.append(StepRoute(distance_m, float(np.linalg.norm(point - there[i])), s / length, rel))
     return out
 
 
-def _along(path: F64, point: F64) -> tuple[float, float, float]:
-    """Return (distance, arc length of the first nearest point, total length)."""
+def _along(path: F64, point: F64, about_m: float = 0.0, reach_m: float = math.inf) -> tuple[float, float, float]:
+    """Return (distance, arc length of the first nearest point at most ``reach_m`` from ``about_m``, total length)."""
     best, best_s, s = math.inf, 0.0, 0.0
     if len(path) == 1:
         return float(np.linalg.norm(point - path[0])), 0.0, 0.0
     for a, b in pairwise(path.tolist()):
         length = math.dist(a, b)
-        distance, f = point_to_segment(point.tolist(), a, b)
-        if distance < best:
-            best, best_s = distance, s + f * length
+        low, high = (min(max((about_m + sign * reach_m - s) / length, 0.0), 1.0) if length > 0 else 0.0 for sign in (-1, 1))
+        ends = [[p + f * (q - p) for p, q in zip(a, b, strict=True)] for f in (low, high)]
+        distance, f = point_to_segment(point.tolist(), *ends)
+        if distance < best and s <= about_m + reach_m and s + length >= about_m - reach_m:
+            best, best_s = distance, s + (low + f * (high - low)) * length
         s += length
     return best, best_s, s
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from evaluators import rollout_values, score
 from evaluators.metrics.reference import point_to_segment
-from evaluators.metrics.route import beside, progress_so_far, to_path
+from evaluators.metrics.route import beside, moving, progress_so_far, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step
 from tests.examples import examples
@@ -106,7 +106,7 @@ xy = st.tuples(st.integers(-6, 6).map(float), st.integers(-6, 6).map(float))
 def test_array_projection_and_twin_agree(points, offset):
     recorded, driven = (np.array(column) for column in zip(*points, strict=True))
     log = rollout(track(driven[:, 0] + offset, driven[:, 1]), log=track(recorded[:, 0] + offset, recorded[:, 1]))
-    if np.all(recorded == recorded[0]):
+    if len(moving(recorded)) == 1:
         return
     found = scored(log)
     slow = route_by_step(log)
@@ -117,7 +117,7 @@ def test_array_projection_and_twin_agree(points, offset):
         # Where the ego is equally far from two parts of the path, rounding picks one of them.
         for name, want in (("progress", [one.progress for one in slow]), ("progress_rel", [one.progress_rel for one in slow])):
             same = np.isclose(found[name].value, want, atol=1e-9)
-            for k in np.flatnonzero(~same):
+            for k in np.flatnonzero(~same)[:1]:  # progress goes on from where it was: a tie decides about all after it
                 assert is_ambiguous(recorded if name == "progress" else recorded[: k + 1], driven[k])
 
 
@@ -191,3 +191,44 @@ def test_a_recording_that_stands_still_has_no_left():
     bias = scored(log)["lateral_bias_m"]
     assert not bias.valid.any()
     assert bias.reason == "the recorded path is shorter than 1 m: it has no direction"
+
+
+@pytest.mark.parametrize("end", ["first", "last"])
+@pytest.mark.parametrize("noise_m", [0.0, 1e-9, 0.05])
+def test_noise_where_the_recorded_car_stands_moves_neither_distance_nor_progress(end, noise_m):
+    rng = np.random.default_rng(3)
+    x = np.concatenate([np.linspace(0.0, 20.0, 41), np.full(100, 20.0)]) if end == "last" else np.append(np.zeros(100), np.linspace(0, 20, 41))
+    log = rollout(track(np.linspace(-18.0, 38.0, 141), 0.3), log=track(x + noise_m * rng.normal(size=141), noise_m * rng.normal(size=141)))
+    found = scored(log)
+    assert np.abs(found["lateral_distance_m"].value - 0.3).max() <= 40 * noise_m + 1e-9
+    assert np.abs(found["lateral_bias_m"].value - 0.3).max() <= 40 * noise_m + 1e-9
+    assert found["progress"].value == pytest.approx(np.clip(np.linspace(-18.0, 38.0, 141) / 20.0, 0.0, 1.0), abs=noise_m + 1e-9)
+
+
+def test_a_recording_that_stands_all_the_time_has_no_length_whatever_its_noise():
+    noise = 0.05 * np.random.default_rng(0).normal(size=(2, 200))
+    found = scored(rollout(track(np.zeros(200), 0.0), log=track(*noise)))
+    assert not found["progress"].valid.any() and not found["lateral_distance_m"].valid.any()
+
+
+def test_progress_on_the_way_out_of_a_u_turn_is_not_that_of_the_way_back_beside_it():
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 21)
+    out, back = np.arange(0.0, 100.0), np.arange(100.0, -1.0, -1.0)
+    path = np.concatenate([np.stack([out, 0 * out]), [100 + 2 * np.cos(turn), 2 + 2 * np.sin(turn)], np.stack([back, 4 + 0 * back])], axis=1)
+    x, y = np.linspace(0, 10, 30), np.minimum(np.linspace(0, 6, 30), 3.0)  # leaves its way to the left, and stops there
+    for k, want in ((0, 10.0), (200, 10.0)):  # however long it stays there
+        ego = track(np.append(x, np.full(k, 10.0)), np.append(y, np.full(k, 3.0)))
+        log = rollout(ego, log=track(path[0], path[1]))
+        assert scored(log)["progress"].value[-1] * (200 + 2 * np.pi) == pytest.approx(want, abs=0.1)
+        assert rollout_values(score(log, scene(TWO_LANES, log), "strict"))["progress"].value < 0.06
+
+
+def test_a_closed_loop_starts_at_its_start_and_ends_at_its_end():
+    angle = np.linspace(0.0, 2 * np.pi, 301)
+    path = track(30 * np.sin(angle), 30 - 30 * np.cos(angle))
+    standing = rollout(track(np.full(60, -0.1), 0.0), log=path)
+    assert scored(standing)["progress"].value.max() == 0.0
+    whole = scored(rollout(path))["progress"].value
+    assert whole == pytest.approx(angle / (2 * np.pi), abs=1e-9)
+    beside_m = track(path.xyz[:, 0] * 0.9, path.xyz[:, 1] * 0.9 + 3.0)
+    assert scored(rollout(beside_m, log=path))["progress"].value[[0, -1]] == pytest.approx([0, 1], abs=1e-3)
