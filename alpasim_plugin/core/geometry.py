@@ -210,8 +210,8 @@ HALF_WIDTH_M = 1.85
 def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
     """Return the plan-view area of a lane as a shapely Polygon or MultiPolygon (empty where nothing has area).
 
-    With both edges it is the ring of the left edge and the reversed right edge; a ring that crosses itself is repaired by
-    ``make_valid`` and only its areal parts are kept. Where an edge is missing, the centre is buffered by ``half_width_m`` (round ends),
+    With both edges it is the ring of the left edge and the reversed right edge; of one that crosses itself, all that it winds round
+    (`ring_area`). Where an edge is missing, the centre is buffered by ``half_width_m`` (round ends),
     which is what the paper's protocol and AlpaSim's off-road rule do.
 
     Args:
@@ -225,8 +225,13 @@ def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
     return ring_area(np.concatenate([lane.left[:, :2], lane.right[::-1, :2]]))
 
 
-def lane_polygons(lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF_WIDTH_M) -> npt.NDArray[Any]:
-    """Return the areas ``(L,)`` of lanes, as `lane_polygon` gives them for lanes moved to an origin ``(3,)``, all in a few calls."""
+def lane_polygons(
+    lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF_WIDTH_M, even_odd: bool = False
+) -> npt.NDArray[Any]:
+    """Return the areas ``(L,)`` of lanes, as `lane_polygon` gives them for lanes moved to an origin ``(3,)``, all in a few calls.
+
+    By ``even_odd`` what a ring winds round twice is a hole, as in AlpaSim.
+    """
     out = np.full(len(lanes), None, dtype=object)
     edged = [(k, one.left[:, :2], one.right[::-1, :2]) for k, one in enumerate(lanes) if one.left is not None and one.right is not None]
     rings = {k: np.concatenate([left, right]) for k, left, right in edged if len(left) + len(right) > 2}
@@ -235,7 +240,7 @@ def lane_polygons(lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF
         owner = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings.values()])
         out[ringed] = shapely.polygons(shapely.linearrings(np.concatenate(list(rings.values())) - origin[:2], indices=owner))
         for k in ringed[~shapely.is_valid(out[ringed])]:
-            out[k] = areal_parts(shapely.make_valid(out[k]))
+            out[k] = areal_parts(shapely.make_valid(out[k])) if even_odd else _wound(out[k])
     for k in [k for k, area in enumerate(out) if area is None]:
         left, right = (None if edge is None else edge - origin for edge in (lanes[k].left, lanes[k].right))
         out[k] = lane_polygon(replace(lanes[k], centre=lanes[k].centre - origin, left=left, right=right), half_width_m)
@@ -243,11 +248,20 @@ def lane_polygons(lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF
 
 
 def ring_area(ring: F64) -> Any:
-    """Return the plan-view area inside a ring ``(N, 2+)``, repaired as in `lane_polygon`."""
+    """Return the plan-view area that a ring ``(N, 2+)`` winds round at least once: a lane on a ramp may lie above itself."""
     if len(ring) < 3:
         return shapely.Polygon()
     polygon = shapely.polygons(np.ascontiguousarray(ring[:, :2]))
-    return polygon if shapely.is_valid(polygon) else areal_parts(shapely.make_valid(polygon))
+    return polygon if shapely.is_valid(polygon) else _wound(polygon)
+
+
+def _wound(polygon: Any) -> Any:
+    """Return what the ring of a polygon winds round; by ``make_valid`` (even-odd), what it winds round twice would be a hole."""
+    faces = shapely.get_parts(shapely.polygonize([shapely.node(shapely.get_exterior_ring(polygon))]))
+    inside = shapely.get_coordinates(shapely.point_on_surface(faces))  # (F, 2)
+    ring = shapely.get_coordinates(polygon)[None] - inside[:, None]  # (F, N, 2)
+    turn = np.diff(np.unwrap(np.arctan2(ring[..., 1], ring[..., 0]), axis=1)[:, [0, -1]])[:, 0]
+    return areal_parts(shapely.union_all(faces[np.abs(turn) > np.pi]))
 
 
 def areal_parts(shape: Any) -> Any:

@@ -147,7 +147,8 @@ class Road:
         asked[lane] = True
         new = [k for k in np.flatnonzero(asked).tolist() if self._areas[k] is None]
         if new:
-            self._areas[new] = lane_polygons([self._lanes[k] for k in new], self.origin, self._preset.lane_half_width_m)
+            preset = self._preset
+            self._areas[new] = lane_polygons([self._lanes[k] for k in new], self.origin, preset.lane_half_width_m, preset.alpasim_map)
             shapely.prepare(self._areas[new])
         return np.asarray(self._areas[lane])
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify, lane_polygon
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify, lane_polygon, lane_polygons
 from alpasim_plugin.core.types import Lane, LaneMap
 from alpasim_plugin.world.route import LaneIndex
 from tests.examples import examples
@@ -63,6 +63,22 @@ def test_edges_that_cross_keep_both_areal_parts():
     assert shape.is_valid
     assert shape.area == pytest.approx(10.0)
     assert shape.geom_type == "MultiPolygon"
+
+
+def test_a_lane_that_turns_450_degrees_covers_where_it_passes_over_itself():
+    angle = np.linspace(0.0, 2.5 * np.pi, 60)
+
+    def at(radius_m):  # a spiral ramp, whose end crosses its beginning
+        r = radius_m + 6.0 * np.maximum(angle - 2 * np.pi, 0.0) - 3.0 * (angle > 2 * np.pi)
+        return np.stack([r * np.cos(angle), r * np.sin(angle), 2.0 * angle], axis=1)
+
+    lane = Lane("ramp", at(20.0), at(18.25), at(21.75))
+    for shape in (lane_polygon(lane), lane_polygons([lane], np.zeros(3))[0]):
+        assert shape.is_valid
+        assert shapely.contains_xy(shape, at(20.0)[1:-1, :2]).all()
+        assert not shapely.contains_xy(shape, 0.0, 0.0)
+    alpasim = lane_polygons([lane], np.zeros(3), even_odd=True)[0]
+    assert not shapely.contains_xy(alpasim, at(20.0)[1:-1, :2]).all()
 
 
 def test_edges_on_top_of_each_other_contain_nothing():
