@@ -69,16 +69,18 @@ def step(state: BicycleState, command: Command, dt_s: float, vehicle: Vehicle, m
     if not all(map(math.isfinite, values)) or dt_s < 0:
         found = f"a value that is not finite, or dt_s = {dt_s} < 0"
         raise InputError("advancing the vehicle", f"{state} under {command}", found, "give finite values and dt_s >= 0")
-    n = max(1, math.ceil(dt_s / max_substep_s - 1e-9))
-    h = dt_s / n
     target = _clip(command.steer_rad, vehicle.max_steer_rad)
     drive = _clip(command.drive_mps2, vehicle.max_accel_mps2)
     brake = min(max(command.brake_mps2, 0.0), vehicle.max_brake_mps2)
-    for _ in range(n):
-        # A constant rate over the sub-step keeps the right-hand side smooth inside it, which order 4 needs.
-        end = state.steer_rad + _clip(target - state.steer_rad, vehicle.max_steer_rate_radps * h)
-        rate = (end - state.steer_rad) / h if h > 0 else 0.0
-        state = _substep(state, rate, drive, brake, h, vehicle.wheelbase_m)
+    turn = target - state.steer_rad
+    slew_s = min(abs(turn) / vehicle.max_steer_rate_radps, dt_s)
+    # No step contains the instant at which the wheel arrives: the right-hand side is smooth inside each, which order 4 needs.
+    for span_s, rate in ((slew_s, math.copysign(vehicle.max_steer_rate_radps, turn)), (dt_s - slew_s, 0.0)):
+        n = math.ceil(span_s / max_substep_s - 1e-9)
+        for _ in range(n):
+            state = _substep(state, rate, drive, brake, span_s / n, vehicle.wheelbase_m)
+        if slew_s < dt_s:
+            state = replace(state, steer_rad=target)
     return state
 
 

@@ -78,6 +78,20 @@ def test_turning_wheel_follows_the_integral_of_the_heading() -> None:
     assert end.yaw_rad == pytest.approx(expected, abs=1e-9)
 
 
+def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_within_one() -> None:
+    """The command of every 50 ms is reached after a part of it, at another instant each time; the finest step is the truth."""
+
+    def drive(step_s: float) -> BicycleState:
+        state = BicycleState(0.0, 0.0, 0.0, 15.0, 0.0)
+        for k in range(80):
+            state = step(state, Command(0.12 * math.sin(0.35 * k) + 0.017 * (k % 3), -1.0), 0.05, VEHICLE, step_s)
+        return state
+
+    truth = drive(2e-4)
+    errors = [error_m(drive(h), truth) for h in (0.05, 0.025, 0.01)]
+    assert errors[0] < 2e-5 and errors[1] < errors[0] / 8 and errors[2] < errors[1] / 20, errors
+
+
 def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can() -> None:
     state, last = BicycleState(0.0, 0.0, 0.0, 8.0, -0.2), -0.2
     for _ in range(150):
