@@ -1,0 +1,1 @@
+"""Scores of other benchmarks on our logs, from their published definitions."""

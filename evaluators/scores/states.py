@@ -1,0 +1,145 @@
+"""What the scores of other benchmarks read of a drive: states of the ego and boxes of the others, on one line of time.
+
+A log holds poses. Velocity is their central difference, acceleration its difference, both in the axes of the vehicle; whoever has measured
+ones gives them instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog
+from evaluators.metrics.footprint import ActorTable, Footprints, origin_of
+from evaluators.metrics.presets import Preset
+
+Kind = Literal["vru", "vehicle", "object"]
+KINDS: dict[str, Kind] = {"pedestrian": "vru", "cyclist": "vru", "car": "vehicle", "truck": "vehicle", "bus": "vehicle", "motorcycle": "vehicle"}
+
+
+@dataclass(frozen=True)
+class EgoStates:
+    """The ego at T instants; metres from an origin, radians.
+
+    Attributes:
+        t_us: ``(T,)`` times.
+        rear_xy: ``(T, 2)`` rear axle.
+        yaw: ``(T,)``.
+        velocity: ``(T, 2)`` along and to the left of the vehicle, m/s.
+        accel: ``(T, 2)`` the same, m/s2.
+        size: length and width, m.
+        ahead_m: From the rear axle to the centre of the box.
+    """
+
+    t_us: I64
+    rear_xy: F64
+    yaw: F64
+    velocity: F64
+    accel: F64
+    size: tuple[float, float]
+    ahead_m: float
+
+    @property
+    def speed(self) -> F64:
+        """Give the speed ``(T,)``, m/s, without a sign."""
+        return np.asarray(np.hypot(self.velocity[:, 0], self.velocity[:, 1]))
+
+    @property
+    def heading(self) -> F64:
+        """Give the unit vectors ``(T, 2)`` ahead."""
+        return np.stack([np.cos(self.yaw), np.sin(self.yaw)], axis=1)
+
+    @property
+    def centre(self) -> F64:
+        """Give the centres ``(T, 2)`` of the box."""
+        return np.asarray(self.rear_xy + self.ahead_m * self.heading)
+
+    def boxes(self, xy: F64, yaw: F64) -> Footprints:
+        """Return the ego's box at centres ``(N, 2)`` and headings ``(N,)``."""
+        return Footprints(xy, yaw, np.broadcast_to(np.array(self.size), (len(xy), 2)))
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """The A other road users at the ego's T instants.
+
+    Attributes:
+        ids, kinds: ``(A,)``.
+        there: ``(A, T)``.
+        xy: ``(A, T, 2)`` box centres, m; yaw ``(A, T)``; size ``(A, 2)`` length and width.
+        velocity: ``(A, T, 2)`` m/s, world axes.
+    """
+
+    ids: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    there: Bool
+    xy: F64
+    yaw: F64
+    size: F64
+    velocity: F64
+
+    @property
+    def speed(self) -> F64:
+        """Give the speeds ``(A, T)``, m/s."""
+        return np.asarray(np.hypot(self.velocity[..., 0], self.velocity[..., 1]))
+
+    def boxes(self, actor: I64, step: I64, after_s: float = 0.0) -> Footprints:
+        """Return the boxes of pairs ``(M,)`` of actor and step, moved on at their velocity for some seconds."""
+        return Footprints(self.xy[actor, step] + after_s * self.velocity[actor, step], self.yaw[actor, step], self.size[actor])
+
+
+def states_of(rollout: RolloutLog, preset: Preset) -> tuple[EgoStates, Tracks]:
+    """Read a log, relative to the origin of `evaluators.metrics.footprint.origin_of` the ego."""
+    origin, t_us = origin_of(rollout.ego_log, preset), rollout.ego.t_us
+    rear = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    yaw, rear_xy = np.unwrap(yaw_from_quat(rollout.ego.quat)), rear.xyz[:, :2] - origin[:2]
+    velocity = in_axes(_rate(rear_xy, t_us), yaw)
+    # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
+    turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
+    size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
+    ego = EgoStates(t_us, rear_xy, yaw, velocity, _rate(velocity, t_us) + turn, size, float(rollout.T_rig_box[0, 3]))
+    table = ActorTable(rollout, preset, origin)
+    at = table.at(t_us)
+    actor, step = np.nonzero(at.present)
+    xy, yaws, v = np.zeros((len(table), len(t_us), 2)), np.zeros(at.present.shape), np.zeros((len(table), len(t_us), 2))
+    boxes = at.footprints(actor, step)
+    xy[actor, step], yaws[actor, step] = boxes.xy, boxes.yaw
+    for a in range(len(table)):
+        there = np.flatnonzero(at.present[a])
+        v[a, there] = _rate(xy[a, there], t_us[there])
+    kinds = tuple(KINDS.get(one.label, "object") for one in rollout.actors.values())
+    return ego, Tracks(table.ids, kinds, at.present, xy, yaws, table.size, v)
+
+
+def _rate(values: F64, t_us: I64) -> F64:
+    """Return the central difference in time of values ``(T, ...)``, per second; 0 of a single one."""
+    return np.zeros_like(values) if len(values) < 2 else np.asarray(np.gradient(values, t_us * 1e-6, axis=0))
+
+
+def in_axes(vectors: F64, yaw: F64) -> F64:
+    """Return vectors ``(T, 2)`` of the world along and to the left of headings ``(T,)``."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)
+
+
+def smooth(values: F64, window: int = 8, order: int = 2) -> F64:
+    """Return values ``(T,)`` through a Savitzky-Golay filter, whose window is never longer than they are."""
+    return np.asarray(savgol_filter(values, min(window, _enough(values, order)), order))
+
+
+def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
+    """Return a derivative in time of values ``(T,)`` by a Savitzky-Golay filter at the mean step, per second to the power of ``times``."""
+    step_s = float(np.mean(np.diff(t_us))) * 1e-6
+    return np.asarray(savgol_filter(values, min(window, _enough(values, order)), order, deriv=times, delta=step_s))
+
+
+def _enough(values: F64, order: int) -> int:
+    if len(values) <= order:
+        found = f"{len(values)} instants, a polynomial of order {order}"
+        raise EvaluatorError("smoothing a drive", "a Savitzky-Golay filter", found, "score a log of more steps")
+    return len(values)

@@ -1,0 +1,80 @@
+"""nuPlan's metrics against the test vectors of its devkit, and in small worlds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluators.scores import nuplan
+from evaluators.scores.states import EgoStates, Tracks
+
+FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtures"
+FILES = sorted(FIXTURES.glob("*/*.json"))
+WIDTH_M, FRONT_M, REAR_M = 2.297, 4.049, 1.127  # of the devkit's vehicle, from its rear axle
+SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_rate")} | {
+    "ego_acceleration": "accel", "ego_lon_acceleration": "lon_accel", "ego_lat_acceleration": "lat_accel", "ego_yaw_acceleration": "yaw_accel",
+}  # fmt: skip
+
+
+def states(rows) -> EgoStates:
+    pose, velocity, accel = (np.array([row[key] for row in rows], dtype=float) for key in ("pose", "velocity", "acceleration"))
+    t_us = np.array([row["time_us"] for row in rows])
+    size = (FRONT_M + REAR_M, WIDTH_M)
+    return EgoStates(t_us, pose[:, :2], pose[:, 2], velocity, accel, size, (FRONT_M - REAR_M) / 2)
+
+
+def tracks(worlds) -> Tracks:
+    kinds = {"bicycles": "vru", "pedestrians": "vru", "vehicles": "vehicle", "genericobjects": "object"}
+    ids = sorted({(kind, one["id"]) for world in worlds for kind in kinds for one in world.get(kind, [])})
+    shape = (len(ids), len(worlds))
+    there, xy, yaw, velocity = np.zeros(shape, bool), np.zeros((*shape, 2)), np.zeros(shape), np.zeros((*shape, 2))
+    size = np.ones((len(ids), 2))
+    for t, world in enumerate(worlds):
+        for kind in kinds:
+            for one in world.get(kind, []):
+                a, box = ids.index((kind, one["id"])), one["box"]
+                there[a, t], xy[a, t], yaw[a, t], size[a] = True, box["pose"][:2], box["pose"][2], box["size"][::-1]
+                velocity[a, t] = one["speed"] * np.array([np.cos(yaw[a, t]), np.sin(yaw[a, t])])
+    return Tracks(tuple(f"{kind} {one}" for kind, one in ids), tuple(kinds[kind] for kind, _ in ids), there, xy, yaw, size, velocity)
+
+
+def found_statistics(name, scene) -> list[float | bool]:
+    """The values that the devkit lists for a metric, in its order, as far as our definitions give them."""
+    ego = states([scene["ego"], *scene.get("ego_future_states", [])])
+    others = tracks([scene["world"], *scene.get("world_future_states", [])])
+    hits = nuplan.collisions(ego, others)
+    guilty = [one for one in hits if one.at_fault]
+    if name in SERIES:
+        of = nuplan.statistics(nuplan.motion(ego)[SERIES[name]])
+        return [of[kind] for kind, _ in scene["expected"]["statistics"] if kind != "BOOLEAN"]
+    if name == "ego_mean_speed":
+        return [nuplan.statistics(ego.speed)["MEAN"]]
+    if name == "ego_expert_l2_error":
+        of = nuplan.statistics(nuplan.position_errors(ego.rear_xy, states(scene["expert_ego_states"]).rear_xy))
+        return [of["MAX"], of["MEAN"], of["P90"]]
+    if name == "no_ego_at_fault_collision":
+        counts = [sum(one.kind == kind for one in guilty) for kind in ("vru", "vehicle", "object")]
+        of = nuplan.statistics(np.array([one.delta_v_mps for one in guilty])) if guilty else {}
+        return [not guilty, len(guilty), *counts, *(of[kind] for kind in ("MAX", "MIN", "MEAN") if of)]
+    if name == "time_to_collision_within_bound":
+        given = scene["metric_parameters"]
+        least = nuplan.time_to_collision(ego, others, hits, None, given["time_step_size"], given["time_horizon"]).min()
+        return [round(least, 2), bool(least > given["least_min_ttc"])]
+    pytest.skip(f"{name} asks for a map or for plans that the file does not hold")
+
+
+@pytest.mark.skipif(not FILES, reason="../shared/data/nuplan-devkit-fixtures is absent")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_devkits_own_test_vectors_give_its_numbers_to_all_printed_digits(path):
+    scene = json.loads(path.read_text())
+    name, expected = path.parent.name, scene["expected"]
+    got = found_statistics(name, scene)
+    wanted = [value for kind, value in expected["statistics"] if name not in SERIES or kind != "BOOLEAN"]
+    # Its tests allow 1.5 units of the second digit, and two of the statistics printed there are cut and not rounded.
+    assert got == pytest.approx(wanted, abs=0.015)
+    if name in SERIES:
+        values = nuplan.motion(states([scene["ego"], *scene["ego_future_states"]]))[SERIES[name]]
+        assert np.round(values, 2).tolist() == expected["time_series"]["values"]
