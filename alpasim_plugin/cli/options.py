@@ -27,6 +27,7 @@ Overrides = Annotated[tuple[str, ...], Flag("Override a scenario key: key=value.
 Overwrite = Annotated[bool, Flag("Replace files that exist.")]
 Every = Annotated[bool, Flag("Print every metric, not only the headline ones.", "--all")]
 Preset = Annotated[str, Flag("Evaluator preset.", names="preset")]
+Presets = Annotated[str, Flag("Evaluator presets, separated by commas.", names="preset")]
 Evaluators = Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")]
 Device = Annotated[Literal["cpu", "cuda"], Flag("Where to compute.")]
 Seed = Annotated[int, Flag("Seed of the noise.", min=0)]

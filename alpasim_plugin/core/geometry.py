@@ -225,9 +225,7 @@ def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
     return ring_area(np.concatenate([lane.left[:, :2], lane.right[::-1, :2]]))
 
 
-def lane_polygons(
-    lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF_WIDTH_M, even_odd: bool = False
-) -> npt.NDArray[Any]:
+def lane_polygons(lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF_WIDTH_M, even_odd: bool = False) -> npt.NDArray[Any]:
     """Return the areas ``(L,)`` of lanes, as `lane_polygon` gives them for lanes moved to an origin ``(3,)``, all in a few calls.
 
     By ``even_odd`` what a ring winds round twice is a hole, as in AlpaSim.

@@ -19,6 +19,7 @@ class Preset:
 
     name: str
     reproduces: str | None = None  # whose evaluation, in which version: stamped on the results with the rest
+    protocol: str | None = None  # the benchmark whose score is given as well, by its name in `evaluators.scores`
     # Footprint. The sizes of all boxes are scaled by 1 - shrink; corners are rounded by roundness * shorter side / 2.
     ego_size_m: tuple[float, float] | None = None  # length, width; None: as logged
     shrink: float = 0.0
@@ -129,6 +130,9 @@ PRESETS: dict[str, Preset] = {
     ALPASIM.name: ALPASIM,
     ALPASIM_LATER.name: ALPASIM_LATER,
     "strict": Preset(name="strict", contact="between_steps", seam_m=0.1, offroad_rule="margin", missing_road="error"),
+    # Other benchmarks go on after an event, and have no score where a part of it cannot be measured.
+    **{name: Preset(name=name, protocol=name, seam_m=0.1, stop_after=()) for name in ("nuplan", "navsim", "hugsim")},
+    "ncap": Preset(name="ncap", protocol="ncap", contact="between_steps", seam_m=0.1),
 }
 
 

@@ -15,6 +15,7 @@ from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.pixels import BLACK_MAX
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.core.types import MetricInfo as MetricInfo
+from evaluators.scores.table import BENCHMARKS
 
 if TYPE_CHECKING:
     from alpasim_plugin.plugins.parts.spec import PartSpec
@@ -340,6 +341,7 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
     "duration_frac_20s": MetricInfo("", "none", "last", "scored time over 20 s", derived=True),
     "scene_score": MetricInfo("", "higher", "last", "AlpaSim's score: 0 after a fault, else saturated progress", derived=True),
     "progress_clipped_rel": MetricInfo("", "higher", "last", "progress at the last scored step", derived=True, is_share=True),
+    **BENCHMARKS,
 })  # fmt: skip
 
 # Series of ``steps.parquet`` that are no metrics: they have no value over a rollout.

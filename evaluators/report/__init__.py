@@ -11,15 +11,18 @@ if TYPE_CHECKING:
     from evaluators.report.fixers import fixer_lines
     from evaluators.report.headline import plan_warnings
     from evaluators.report.html import write_report
-    from evaluators.report.terminal import ending_lines, next_line, render_table
+    from evaluators.report.terminal import ending_lines, next_line, render_presets, render_table
 
-__all__ = ["ending_lines", "fixer_lines", "next_line", "plan_warnings", "render_table", "write_junit", "write_report", "write_summary_md"]
+__all__ = [
+    "ending_lines", "fixer_lines", "next_line", "plan_warnings", "render_presets", "render_table", "write_junit", "write_report",
+    "write_summary_md",
+]  # fmt: skip
 
 _HOMES = {
     ".ci": ("write_junit", "write_summary_md"),
     ".fixers": ("fixer_lines",),
     ".headline": ("plan_warnings",),
     ".html": ("write_report",),
-    ".terminal": ("ending_lines", "next_line", "render_table"),
+    ".terminal": ("ending_lines", "next_line", "render_presets", "render_table"),
 }
 __getattr__ = lazy_names(__name__, {name: home for home, names in _HOMES.items() for name in names})

@@ -19,10 +19,44 @@ from evaluators.report.flips import find_flips, flip_bases
 from evaluators.report.headline import Finding, find
 from evaluators.report.numbers import Cell, finite, fixed, plural
 from evaluators.report.tables import metric_rows
+from evaluators.scores.table import SCORES
 from evaluators.statistics.arms import Arm
 
 MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 %, scenes as clusters"
 GAP_NOTE = "; \u2014: one rollout or one scene is too few, or no valid value (report.html says which)"
+
+
+def render_presets(summaries: Mapping[str, Mapping[str, Any]], known: MetricTable = METRICS) -> Table:
+    """Lay out the scores of several presets on the same logs: a benchmark's own scores, of the other presets their headline metrics.
+
+    Args:
+        summaries: Preset -> content of its ``summary.json``.
+        known: What the metrics are.
+
+    A score that is not measured in every rollout shows the range of its mean, and what is missing.
+    """
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    columns = list(dict.fromkeys(variant for one in summaries.values() for variant in one.get("metrics") or {}))
+    for head in ("preset", "score", *columns):
+        table.add_column(Text(escape(head)), overflow="fold")
+    for preset, summary in summaries.items():
+        for name in [f"{preset}_{score}" for score in SCORES.get(preset, {})] or known.headline:
+            cells = [_score_cell((summary.get("metrics") or {}).get(variant, {}), name, known.shown(name).in_percent) for variant in columns]
+            table.add_row(preset, name, *cells)
+    return table
+
+
+def _score_cell(metrics: Mapping[str, Mapping[str, Any]], name: str, in_percent: bool) -> Text:
+    def text(value: float) -> str:
+        return f"{100 * value:.1f} %" if in_percent else f"{value:.3f}"
+
+    one, least, most = (metrics.get(name + end) or {} for end in ("", "_least", "_most"))
+    if one.get("mean") is not None and not one.get("n_invalid"):
+        return Text(text(one["mean"]))
+    reason = Text(escape(str(one.get("reason") or f"not measured in {one.get('n_invalid', 'any')} of the rollouts")), style="dim")
+    if least.get("mean") is None or most.get("mean") is None:
+        return reason
+    return Text(f"{text(least['mean'])} to {text(most['mean'])} ").append_text(reason)
 
 
 def render_table(summary: Mapping[str, Any], headline_only: bool = False, known: MetricTable = METRICS) -> Table:

@@ -20,6 +20,7 @@ STANDS_MPS = 5e-3
 AHEAD_RAD, BEHIND_RAD = np.deg2rad(30.0), np.deg2rad(150.0)
 TTC_STEP_S, TTC_HORIZON_S, LEAST_TTC_S = 0.1, 3.0, 0.95
 OBJECTS_ALLOWED = 1
+LEAST_INSTANTS = 3  # a polynomial of order 3 needs more
 MASS_SHARE = 0.5  # of the other's mass in the sum of both: 2000 kg each
 COMFORT = {  # least and greatest: m/s2, m/s3, rad/s, rad/s2
     "lon_accel": (-4.05, 2.40), "lat_accel": (-4.89, 4.89), "lon_jerk": (-4.13, 4.13), "jerk": (-8.37, 8.37),
@@ -152,7 +153,9 @@ def motion(ego: EgoStates) -> dict[str, F64]:
     """
     accel = {"lon_accel": ego.accel[:, 0], "lat_accel": ego.accel[:, 1], "accel": np.hypot(ego.accel[:, 0], ego.accel[:, 1])}
     out = {name: smooth(values) for name, values in accel.items()}
-    out |= {to: derivative(out[of], ego.t_us, window=15) for to, of in (("lon_jerk", "lon_accel"), ("lat_jerk", "lat_accel"), ("jerk", "accel"))}
+    out |= {
+        to: derivative(out[of], ego.t_us, window=15) for to, of in (("lon_jerk", "lon_accel"), ("lat_jerk", "lat_accel"), ("jerk", "accel"))
+    }
     yaw = np.unwrap(ego.yaw)
     return out | {"yaw_rate": derivative(yaw, ego.t_us), "yaw_accel": derivative(yaw, ego.t_us, order=3, times=2)}
 

@@ -10,16 +10,23 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
-from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog
+from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.metrics.footprint import ActorTable, Footprints, origin_of
 from evaluators.metrics.presets import Preset
 
 Kind = Literal["vru", "vehicle", "object"]
-KINDS: dict[str, Kind] = {"pedestrian": "vru", "cyclist": "vru", "car": "vehicle", "truck": "vehicle", "bus": "vehicle", "motorcycle": "vehicle"}
+KINDS: dict[str, Kind] = {
+    "pedestrian": "vru",
+    "cyclist": "vru",
+    "car": "vehicle",
+    "truck": "vehicle",
+    "bus": "vehicle",
+    "motorcycle": "vehicle",
+}
 
 
 @dataclass(frozen=True)
@@ -93,11 +100,14 @@ class Tracks:
         return Footprints(self.xy[actor, step] + after_s * self.velocity[actor, step], self.yaw[actor, step], self.size[actor])
 
 
-def states_of(rollout: RolloutLog, preset: Preset) -> tuple[EgoStates, Tracks]:
-    """Read a log, relative to the origin of `evaluators.metrics.footprint.origin_of` the ego."""
-    origin, t_us = origin_of(rollout.ego_log, preset), rollout.ego.t_us
-    rear = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    yaw, rear_xy = np.unwrap(yaw_from_quat(rollout.ego.quat)), rear.xyz[:, :2] - origin[:2]
+def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> tuple[EgoStates, Tracks]:
+    """Return the states of a trajectory of the ego's box centre, driven or planned, and the others as the log has them at its times.
+
+    Positions are relative to `evaluators.metrics.footprint.origin_of` the recorded drive.
+    """
+    origin, t_us = origin_of(rollout.ego_log, preset), centre.t_us
+    rear = offset_trajectory(centre, inverse(rollout.T_rig_box))
+    yaw, rear_xy = np.unwrap(yaw_from_quat(centre.quat)), rear.xyz[:, :2] - origin[:2]
     velocity = in_axes(_rate(rear_xy, t_us), yaw)
     # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
     turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
@@ -129,13 +139,13 @@ def in_axes(vectors: F64, yaw: F64) -> F64:
 
 def smooth(values: F64, window: int = 8, order: int = 2) -> F64:
     """Return values ``(T,)`` through a Savitzky-Golay filter, whose window is never longer than they are."""
-    return np.asarray(savgol_filter(values, min(window, _enough(values, order)), order))
+    return np.asarray(scipy.signal.savgol_filter(values, min(window, _enough(values, order)), order))
 
 
 def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
     """Return a derivative in time of values ``(T,)`` by a Savitzky-Golay filter at the mean step, per second to the power of ``times``."""
     step_s = float(np.mean(np.diff(t_us))) * 1e-6
-    return np.asarray(savgol_filter(values, min(window, _enough(values, order)), order, deriv=times, delta=step_s))
+    return np.asarray(scipy.signal.savgol_filter(values, min(window, _enough(values, order)), order, deriv=times, delta=step_s))
 
 
 def _enough(values: F64, order: int) -> int:

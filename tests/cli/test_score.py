@@ -53,6 +53,21 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
 
 
+def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp_path, capsys):
+    out = tmp_path / "scored"
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--preset", "strict,navsim,ncap", "--out", str(out), "--no-report"]
+    assert run_command([*command, "--quiet"]) == 0
+    table = capsys.readouterr().out
+    assert [line.split()[0] for line in table.splitlines() if "pdms" in line or "_score" in line] == ["navsim", "navsim", "ncap"]
+    assert "strict" in table and "not measured" in table
+    assert {path.name for path in out.iterdir()} == {"strict", "navsim", "ncap"}
+    assert run_command([*command, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["exit_code"], list(printed["presets"])) == (0, ["strict", "navsim", "ncap"])
+    assert printed["presets"]["ncap"]["summary"]["metrics"]["clean"]["ncap_score"]["mean"] == 5.0
+    assert run_command([*command[:5], "strict,waymax"]) == 2
+
+
 def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
     out = tmp_path / "scored"
     command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet", "--no-report"]

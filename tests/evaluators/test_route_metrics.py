@@ -197,7 +197,11 @@ def test_a_recording_that_stands_still_has_no_left():
 @pytest.mark.parametrize("noise_m", [0.0, 1e-9, 0.05])
 def test_noise_where_the_recorded_car_stands_moves_neither_distance_nor_progress(end, noise_m):
     rng = np.random.default_rng(3)
-    x = np.concatenate([np.linspace(0.0, 20.0, 41), np.full(100, 20.0)]) if end == "last" else np.append(np.zeros(100), np.linspace(0, 20, 41))
+    x = (
+        np.concatenate([np.linspace(0.0, 20.0, 41), np.full(100, 20.0)])
+        if end == "last"
+        else np.append(np.zeros(100), np.linspace(0, 20, 41))
+    )
     log = rollout(track(np.linspace(-18.0, 38.0, 141), 0.3), log=track(x + noise_m * rng.normal(size=141), noise_m * rng.normal(size=141)))
     found = scored(log)
     assert np.abs(found["lateral_distance_m"].value - 0.3).max() <= 40 * noise_m + 1e-9
@@ -214,7 +218,9 @@ def test_a_recording_that_stands_all_the_time_has_no_length_whatever_its_noise()
 def test_progress_on_the_way_out_of_a_u_turn_is_not_that_of_the_way_back_beside_it():
     turn = np.linspace(-np.pi / 2, np.pi / 2, 21)
     out, back = np.arange(0.0, 100.0), np.arange(100.0, -1.0, -1.0)
-    path = np.concatenate([np.stack([out, 0 * out]), [100 + 2 * np.cos(turn), 2 + 2 * np.sin(turn)], np.stack([back, 4 + 0 * back])], axis=1)
+    path = np.concatenate(
+        [np.stack([out, 0 * out]), [100 + 2 * np.cos(turn), 2 + 2 * np.sin(turn)], np.stack([back, 4 + 0 * back])], axis=1
+    )
     x, y = np.linspace(0, 10, 30), np.minimum(np.linspace(0, 6, 30), 3.0)  # leaves its way to the left, and stops there
     for k, want in ((0, 10.0), (200, 10.0)):  # however long it stays there
         ego = track(np.append(x, np.full(k, 10.0)), np.append(y, np.full(k, 3.0)))

@@ -1,0 +1,143 @@
+"""What several scores ask of one trajectory of the ego: contacts, time to collision, road, direction, comfort."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Scene, Trajectory
+from evaluators.metrics.collision import NOT_LOOKED_FOR
+from evaluators.metrics.footprint import Footprints, origin_of
+from evaluators.metrics.presets import Preset
+from evaluators.metrics.road import Road, road_of
+from evaluators.scores import nuplan
+from evaluators.scores.states import states_of
+
+Part = float | str  # a value, or what is missing
+NO_MAP, NO_LIMITS, SHORT = "a map", "the speed limits of the lanes", "more than three instants"
+
+
+class Judged:
+    """One trajectory of the ego's box centre, driven or planned, among the road users of a log."""
+
+    def __init__(self, rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> None:
+        self.ego, self.tracks = states_of(rollout, preset, centre)
+        self._lanes = list(scene.lane_map.lanes.values())
+        self._xyz = centre.xyz - origin_of(rollout.ego_log, preset)
+        self._road = road_of(scene.lane_map, origin_of(scene.ego_log, preset), preset) if self._lanes else None
+        self._looked_for = scene.standing != "unknown"
+
+    @property
+    def road(self) -> Road:
+        """Give the road; ask `has_map` before."""
+        assert self._road is not None
+        return self._road
+
+    @property
+    def has_map(self) -> bool:
+        """Tell whether lanes are known."""
+        return self._road is not None
+
+    @cached_property
+    def boxes(self) -> Footprints:
+        """The ego's boxes ``(T,)``."""
+        return self.ego.boxes(self.ego.centre, self.ego.yaw)
+
+    @cached_property
+    def _in_lanes(self) -> tuple[I64, I64]:
+        """Pairs of step and lane whose area holds the centre of the box."""
+        step, lane = np.nonzero(self.road.lanes_near(self._xyz))
+        inside = shapely.contains_xy(self.road.areas(lane), *self.ego.centre[step].T)
+        return step[inside], lane[inside]
+
+    @cached_property
+    def astray(self) -> Bool | None:
+        """Where ``(T,)`` no single lane holds the ego: it is in several, or off the road; None without a map."""
+        if not self.has_map:
+            return None
+        step, lane = self._in_lanes
+        out = np.ones(len(self._xyz), dtype=np.bool_)
+        out[step[shapely.covers(self.road.areas(lane), self.boxes.shapes()[step])]] = False
+        return out
+
+    @cached_property
+    def hits(self) -> list[nuplan.Collision]:
+        """Its collisions."""
+        return nuplan.collisions(self.ego, self.tracks, self.astray)
+
+    def contact(self) -> Part:
+        """Return nuPlan's score of contacts at fault."""
+        value = nuplan.collision_score(self.hits)
+        return value if value == 0 or self._looked_for else NOT_LOOKED_FOR
+
+    @cached_property
+    def ttc_s(self) -> F64:
+        """Seconds ``(T,)`` to a collision."""
+        beside = self.astray
+        if beside is not None:
+            step, lane = self._in_lanes
+            beside = beside.copy()
+            beside[step[np.array([self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_)]] = True
+        return nuplan.time_to_collision(self.ego, self.tracks, self.hits, beside)
+
+    def time_to_collision(self) -> Part:
+        """Return whether the time to a collision is always long enough."""
+        return float(self.ttc_s.min() > nuplan.LEAST_TTC_S)
+
+    def drivable(self, beyond_m: float) -> Part:
+        """Return whether no part of the ego is ever farther than this off the drivable surface."""
+        if not self.has_map:
+            return NO_MAP
+        return float(self.road.surface.margin_m(self.boxes.shapes(), self._xyz).min() >= -beyond_m)
+
+    @cached_property
+    def against_m(self) -> F64:
+        """Metres ``(T,)`` driven against the lanes within the last `nuplan.AGAINST_S`; of several lanes the one that agrees best counts."""
+        step, lane = self._in_lanes
+        moved = np.diff(self.ego.centre, axis=0, prepend=self.ego.centre[:1])[step]
+        heading = self.road.heading_at(lane, self.ego.centre[step])
+        best = np.full(len(self._xyz), -np.inf)
+        np.maximum.at(best, step, moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading))
+        total = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(best), np.maximum(-best, 0.0), 0.0))])
+        first = np.searchsorted(self.ego.t_us, self.ego.t_us - round(nuplan.AGAINST_S * 1e6), side="right")
+        return np.asarray(total[1:] - total[first])
+
+    def direction(self) -> Part:
+        """Return nuPlan's score of driving with the traffic."""
+        return nuplan.direction_score(float(self.against_m.max())) if self.has_map else NO_MAP
+
+    def speed_limit(self) -> Part:
+        """Return nuPlan's score of the speed limit: the highest of the lanes under the ego, where one is known."""
+        limits = np.array([one.speed_limit_mps or np.nan for one in self._lanes])
+        if not self.has_map or np.isnan(limits).all():
+            return NO_LIMITS
+        step, lane = self._in_lanes
+        allowed = np.full(len(self._xyz), -np.inf)
+        np.maximum.at(allowed, step, np.where(np.isnan(limits), np.inf, limits)[lane])
+        return nuplan.speed_limit_score(np.where(np.isfinite(allowed), self.ego.speed - allowed, 0.0), self.ego.t_us)
+
+    @cached_property
+    def uncomfortable(self) -> Bool:
+        """Where ``(T,)`` a bound of comfort is broken."""
+        return nuplan.uncomfortable(nuplan.motion(self.ego))
+
+    def comfort(self) -> Part:
+        """Return whether the drive is within nuPlan's bounds of comfort."""
+        return SHORT if len(self._xyz) <= nuplan.LEAST_INSTANTS else float(not self.uncomfortable.any())
+
+    def lane_keeping(self, off_m: float = 0.5, for_s: float = 2.0) -> Part:
+        """Return whether the ego never stays farther from the middle of its lane than this for so long; at junctions it may."""
+        if not self.has_map:
+            return NO_MAP
+        step, lane = self._in_lanes
+        free = np.array([self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_)
+        centres = [shapely.linestrings(self._lanes[k].centre[:, :2] - self.road.origin[:2]) for k in lane.tolist()]
+        away = np.full(len(self._xyz), np.inf)
+        np.minimum.at(
+            away, step, np.where(free, 0.0, shapely.distance(np.array(centres, dtype=object), shapely.points(self.ego.centre[step])))
+        )
+        far = np.isfinite(away) & (away > off_m)
+        began = np.maximum.accumulate(np.where(far, 0, self.ego.t_us))  # the last instant at which it was not far
+        return float(not np.any(far & (self.ego.t_us - began > for_s * 1e6)))

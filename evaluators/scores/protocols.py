@@ -1,0 +1,199 @@
+"""The scores of other benchmarks over one rollout: their parts, what is missing of them, and the range in which the score then lies.
+
+A part that a log cannot give is not measured, never 0. The score is then known only if the others decide it; its least and its greatest
+possible value are always given. What each benchmark publishes and how far our logs go is in docs/presets.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alpasim_plugin.core.geometry import offset_trajectory
+from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scene, Trajectory
+from evaluators.metrics.collision import NOT_LOOKED_FOR, contact_events
+from evaluators.metrics.footprint import origin_of
+from evaluators.metrics.presets import Preset
+from evaluators.metrics.route import OnRoute, on_route, recorded_path
+from evaluators.metrics.score import relevant, series, with_preset
+from evaluators.metrics.surface import MARGIN_M
+from evaluators.scores import nuplan
+from evaluators.scores.judged import Judged, Part
+from evaluators.scores.states import states_of
+from evaluators.scores.table import MOST, PARTS
+
+Values = Mapping[str, float]
+NO_PATH, NO_PLANS, NOT_DRIVEN = "a recorded path with a length", "a plan of more than three poses", "a step that the policy drove"
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The score of one benchmark.
+
+    Attributes:
+        measure: Gives the parts of the scored part of a rollout, the ego's box centres; `evaluators.scores.table` says what they are.
+        scores: Score -> its rule over the parts, never lower for a higher part.
+    """
+
+    measure: Callable[[RolloutLog, Scene, Preset, Trajectory], Mapping[str, Part]]
+    scores: Mapping[str, Callable[[Values], float]]
+
+
+def _route(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> tuple[OnRoute, OnRoute]:
+    """Return where the scored ego is on the recorded path, and where the recording is at the same times."""
+    origin, recorded = origin_of(rollout.ego_log, preset), recorded_path(rollout, preset)
+    path = recorded.xyz[:, :2] - origin[:2]
+    there = np.stack([np.interp(centre.t_us, recorded.t_us, path[:, axis]) for axis in (0, 1)], axis=1)
+    return on_route(path, recorded.t_us, centre.t_us, centre.xyz[:, :2] - origin[:2]), on_route(path, recorded.t_us, centre.t_us, there)
+
+
+def _progress(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> Part:
+    ego, expert = _route(rollout, preset, centre)
+    made = [float(one.along_m[-1] - one.along_m[0]) for one in (ego, expert)]
+    return nuplan.progress_ratio(made[0], made[1]) if ego.length_m > 0 else NO_PATH
+
+
+def _nuplan(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> Mapping[str, Part]:
+    drive, made = Judged(rollout, scene, preset, centre), _progress(rollout, preset, centre)
+    return {
+        "no_at_fault_collision": drive.contact(),
+        "drivable_area": drive.drivable(nuplan.OFF_AREA_M),
+        "making_progress": made if isinstance(made, str) else float(made >= nuplan.PROGRESS_SHARE),
+        "driving_direction": drive.direction(),
+        "progress": made,
+        "time_to_collision": drive.time_to_collision(),
+        "speed_limit": drive.speed_limit(),
+        "comfort": drive.comfort(),
+    }
+
+
+def _navsim(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> Mapping[str, Part]:
+    drive = Judged(rollout, scene, preset, centre)
+    return {
+        "nc": drive.contact(),
+        "dac": drive.drivable(MARGIN_M),
+        "ddc": drive.direction(),
+        "tlc": "the states of the traffic lights",
+        "ep": "the progress of PDM-Closed in the same scene",
+        "ttc": drive.time_to_collision(),
+        "lk": drive.lane_keeping(),
+        "hc": drive.comfort(),
+        "ec": "the plans of the step before, as far as 4 s at 10 Hz",
+    }
+
+
+def _weighted(values: Values, weights: Values) -> float:
+    return sum(weight * values[name] for name, weight in weights.items()) / sum(weights.values())
+
+
+PDMS = {"ep": 5.0, "ttc": 5.0, "hc": 2.0}
+EPDMS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0, "ec": 2.0}
+
+
+def _hugsim(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> Mapping[str, Part]:
+    """Judge every plan by where the others really are at its times; each part is a mean over plans, ``hd`` that of their product."""
+    rows: list[dict[str, Part]] = []
+    for plan in rollout.plans:
+        inside = plan.trajectory.t_us <= rollout.ego.t_us[-1]
+        if plan.now_us < centre.t_us[0] or np.sum(inside) <= nuplan.LEAST_INSTANTS:
+            continue
+        rig = plan.trajectory
+        way = offset_trajectory(replace(rig, t_us=rig.t_us[inside], xyz=rig.xyz[inside], quat=rig.quat[inside]), rollout.T_rig_box)
+        drive = Judged(rollout, scene, preset, way)
+        nc = float(not drive.hits)
+        rows.append(
+            {
+                "nc": nc if nc == 0 or scene.standing != "unknown" else NOT_LOOKED_FOR,
+                "dac": drive.drivable(MARGIN_M),
+                "ttc": drive.time_to_collision(),
+                "com": drive.comfort(),
+            }
+        )
+    ego, _ = _route(rollout, preset, centre)
+    completed: Part = float(ego.along_m[-1]) / ego.length_m if ego.length_m > 0 else NO_PATH
+    out: dict[str, Part] = {"rc": completed}
+    for name in ("nc", "dac", "ttc", "com"):
+        of = [row[name] for row in rows]
+        out[name] = next((one for one in of if isinstance(one, str)), NO_PLANS if not of else float(np.mean([float(x) for x in of])))
+    product = [_bounds(row, lambda one: one["nc"] * one["dac"] * _weighted(one, {"ttc": 5.0, "com": 2.0}), 1.0) for row in rows]
+    why = next((one for row in rows for one in row.values() if isinstance(one, str)), NO_PLANS)
+    out["hd"] = float(np.mean([low for low, _ in product])) if product and all(low == high for low, high in product) else why
+    return out
+
+
+def _ncap(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> Mapping[str, Part]:
+    """Compare the speed of the impact with that of a drive that goes on as it was at the handover."""
+    impact = _impact_mps(rollout, preset, centre)
+    first = states_of(rollout, preset, rollout.ego)[0]
+    k = int(np.searchsorted(rollout.ego.t_us, centre.t_us[0]))
+    after_s = (centre.t_us - centre.t_us[0]) * 1e-6
+    v = first.velocity[k, 0] * first.heading[k]
+    xyz = centre.xyz[0] + np.concatenate([after_s[:, None] * v, np.zeros((len(after_s), 1))], axis=1)
+    still = replace(centre, xyz=xyz, quat=np.repeat(centre.quat[:1], len(after_s), axis=0))
+    passive = _impact_mps(rollout, preset, still)
+    if impact is None:
+        score: Part = 5.0 if scene.standing != "unknown" else NOT_LOOKED_FOR
+    else:
+        score = "an impact of a drive that does nothing" if not passive else 4.0 * max(0.0, 1.0 - impact / passive)
+    none = "an impact"
+    return {"points": score, "impact_mps": none if impact is None else impact, "passive_impact_mps": none if passive is None else passive}
+
+
+def _impact_mps(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> float | None:
+    """Return the relative speed at the first contact at or between the times of a trajectory; None without one."""
+    found = contact_events(replace(rollout, ego=centre, render_start_us=int(centre.t_us[0]), force_gt_us=0), preset)
+    if not found:
+        return None
+    ego, tracks = states_of(rollout, preset, centre)
+    k = max(int(np.searchsorted(ego.t_us - ego.t_us[0], round(found[0].t_s * 1e6))) - 1, 0)  # before it, when nothing is shoved yet
+    a = tracks.ids.index(found[0].actor_id)
+    k = k if tracks.there[a, k] else int(np.argmax(tracks.there[a]))
+    return float(np.hypot(*(ego.velocity[k, 0] * ego.heading[k] - tracks.velocity[a, k])))
+
+
+PROTOCOLS = {
+    "nuplan": Protocol(_nuplan, {"score": nuplan.closed_loop_score}),
+    "navsim": Protocol(
+        _navsim,
+        {
+            "pdms": lambda one: one["nc"] * one["dac"] * _weighted(one, PDMS),
+            "epdms": lambda one: one["nc"] * one["dac"] * one["ddc"] * one["tlc"] * _weighted(one, EPDMS),
+        },
+    ),
+    "hugsim": Protocol(_hugsim, {"hd_score": lambda one: one["hd"] * one["rc"]}),
+    "ncap": Protocol(_ncap, {"score": lambda one: one["points"]}),
+}
+
+
+def _bounds(parts: Mapping[str, Part], rule: Callable[[Values], float], most: float) -> tuple[float, float]:
+    """Return the least and the greatest value of a rule over parts of which some are not measured."""
+    low, high = ({name: end if isinstance(part, str) else part for name, part in parts.items()} for end in (0.0, most))
+    return rule(low), rule(high)
+
+
+def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+    """Give the parts and scores of the preset's benchmark, the same at every step; nothing by presets that are none's."""
+    if preset.protocol is None:
+        return []
+    protocol, rows = PROTOCOLS[preset.protocol], relevant(rollout)
+    if rows.any():
+        ego = rollout.ego
+        parts = protocol.measure(rollout, scene, preset, replace(ego, t_us=ego.t_us[rows], xyz=ego.xyz[rows], quat=ego.quat[rows]))
+    else:
+        parts = dict.fromkeys(PARTS[preset.protocol], NOT_DRIVEN)
+    out: dict[str, Part] = {}
+    for score, rule in protocol.scores.items():
+        low, high = _bounds(parts, rule, MOST.get(preset.protocol, 1.0))
+        read = [part for name, part in parts.items() if not name.endswith("_mps")]
+        missing = "; ".join(dict.fromkeys(part for part in read if isinstance(part, str)))
+        out |= {score: low if low == high else missing, f"{score}_least": low, f"{score}_most": high}
+    t_us = rollout.ego.t_us
+    return [
+        series(f"{preset.protocol}_{name}", t_us, np.nan if isinstance(one, str) else one, not isinstance(one, str), f"not measured: {one}")
+        for name, one in (out | dict(parts)).items()
+    ]
+
+
+FACTORY = with_preset(evaluate_protocol)

@@ -1,0 +1,135 @@
+"""Scores of other benchmarks in small worlds, whose numbers follow from their definitions by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.types import LoggedPlan
+from evaluators import reduce_rollout, score
+from evaluators.scores.protocols import PROTOCOLS
+from evaluators.scores.table import PARTS, SCORES
+from tests.evaluators.eval_build import TWO_LANES, car, road_map, rollout, scene, track
+
+N = 80
+CRUISE = np.linspace(0.0, 63.2, N)  # 8 m/s
+
+
+def values(log, preset, where=TWO_LANES, **more):
+    one = replace(scene(where, log), **more)
+    return {name: found.value if found.valid else found.reason for name, found in reduce_rollout(score(log, one, preset), preset).values.items()}
+
+
+def braking(at=40.0, to=20.0):
+    """A drive that stops in front of a standing car with 5 m/s2, as the recording does not."""
+    t = np.arange(N) * 0.1
+    v = np.maximum(8.0 - 5.0 * np.maximum(t - 2.5, 0.0), 0.0)
+    x = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) * 0.05)])
+    return rollout(track(x, 0.0), [car("stands", track(np.full(N, at), 0.0))], log=track(CRUISE, 0.0))
+
+
+LIMITED = road_map(*(replace(one, speed_limit_mps=7.0) for one in TWO_LANES.lanes.values()), edges=TWO_LANES.road_edges)
+
+
+def test_nuplan_of_a_clean_drive_is_known_only_where_the_speed_limits_are():
+    log = rollout(track(CRUISE, 0.0))
+    free = values(log, "nuplan")
+    assert free["nuplan_score"] == "not measured: the speed limits of the lanes"
+    assert (free["nuplan_score_least"], free["nuplan_score_most"]) == (0.75, 1.0)
+    limited = values(log, "nuplan", LIMITED)
+    assert limited["nuplan_speed_limit"] == pytest.approx(1 - 1 / 2.23)
+    assert limited["nuplan_score"] == pytest.approx((5 + 5 + 4 * (1 - 1 / 2.23) + 2) / 16)
+
+
+def test_nuplan_of_a_hard_stop_loses_progress_and_comfort_but_nothing_else():
+    found = values(braking(), "nuplan", LIMITED)
+    assert found["nuplan_no_at_fault_collision"] == found["nuplan_driving_direction"] == found["nuplan_drivable_area"] == 1.0
+    assert found["nuplan_comfort"] == 0.0
+    assert found["nuplan_progress"] == pytest.approx((8 * 2.5 + 6.4) / 63.2, abs=0.01)
+    assert found["nuplan_making_progress"] == 1.0
+
+
+def test_a_multiplier_of_zero_decides_whatever_else_is_missing():
+    log = rollout(track(CRUISE, 0.0), [car("stands", track(np.full(N, 40.0), 0.0))])
+    assert values(log, "nuplan")["nuplan_score"] == 0.0
+    assert values(log, "navsim")["navsim_pdms"] == values(log, "navsim")["navsim_epdms"] == 0.0
+
+
+def test_an_object_costs_a_half_and_an_actor_that_runs_into_the_ego_nothing():
+    cone = replace(car("cone", track(np.full(N, 40.0), 0.0)), label="other")
+    assert values(rollout(track(CRUISE, 0.0), [cone]), "nuplan")["nuplan_no_at_fault_collision"] == 0.5
+    chaser = car("chaser", track(np.linspace(-12.0, 70.0, N), 0.0))
+    assert values(rollout(track(CRUISE, 0.0), [chaser]), "nuplan")["nuplan_no_at_fault_collision"] == 1.0
+
+
+def test_driving_against_the_lane_costs_the_direction_and_a_short_way_back_does_not():
+    against = rollout(track(CRUISE[::-1], 0.0, yaw=np.pi))
+    assert values(against, "nuplan")["nuplan_driving_direction"] == 0.0
+    back = rollout(track(np.append(CRUISE[:-10], CRUISE[-11] - 0.15 * np.arange(10)), 0.0), log=track(CRUISE, 0.0))
+    assert values(back, "nuplan")["nuplan_driving_direction"] == 1.0
+
+
+def test_leaving_the_road_by_20_cm_is_within_nuplans_area_and_not_within_navsims():
+    y = np.full(N, -1.75 + 0.9 - 0.2)  # half the car is 0.9 m
+    log = rollout(track(CRUISE, y), box=replace(car("a", track(0.0, 0.0)).box, width_m=1.8))
+    assert (values(log, "nuplan")["nuplan_drivable_area"], values(log, "navsim")["navsim_dac"]) == (1.0, 0.0)
+
+
+def test_navsim_names_what_is_missing_and_keeps_the_middle_of_the_lane():
+    log = rollout(track(CRUISE, np.where(np.arange(N) < 30, 0.6, 0.0)))
+    found = values(log, "navsim")
+    assert found["navsim_lk"] == 0.0
+    assert values(rollout(track(CRUISE, np.where(np.arange(N) < 15, 0.6, 0.0))), "navsim")["navsim_lk"] == 1.0
+    assert "traffic lights" in found["navsim_epdms"]
+    assert "PDM-Closed" in found["navsim_pdms"]
+
+
+def plans(log, length_m, n=3):
+    """Straight plans of 2 s at three times, each as long as given."""
+    rig = rollout(log.ego).ego_log
+    out = []
+    for k in (5, 20, 35)[:n]:
+        ahead = track(np.linspace(0.0, length_m, 21) + rig.xyz[k, 0], 0.0, t_us=log.ego.t_us[k] + 100_000 * np.arange(21))
+        out.append(LoggedPlan(int(log.ego.t_us[k]), int(log.ego.t_us[k]), ahead))
+    return replace(log, plans=tuple(out))
+
+
+def test_hugsim_judges_plans_and_multiplies_by_the_route():
+    log = plans(rollout(track(CRUISE / 2, 0.0), log=track(CRUISE, 0.0)), 16.0)
+    assert values(log, "hugsim")["hugsim_hd_score"] == pytest.approx(0.5, abs=0.01)
+    stands = plans(rollout(track(CRUISE / 2, 0.0), [car("stands", track(np.full(N, 32.0), 0.0))], log=track(CRUISE, 0.0)), 16.0)
+    found = values(stands, "hugsim")
+    assert found["hugsim_nc"] == pytest.approx(2 / 3)  # the third plan runs into it
+    assert found["hugsim_hd"] <= found["hugsim_nc"]
+    assert values(rollout(track(CRUISE, 0.0)), "hugsim")["hugsim_hd_score"] == "not measured: a plan of more than three poses"
+
+
+def test_ncap_is_5_without_contact_and_compares_the_impact_with_doing_nothing():
+    assert values(braking(), "ncap")["ncap_score"] == 5.0
+    found = values(braking(at=24.0), "ncap")  # brakes too late: 8 m/s at 17.5 m, 3 m to go
+    passive = found["ncap_passive_impact_mps"]
+    assert passive == pytest.approx(8.0, abs=0.05)
+    assert 0 < found["ncap_impact_mps"] <= 8.0
+    assert found["ncap_score"] == pytest.approx(4 * (1 - found["ncap_impact_mps"] / passive))
+    whole = values(rollout(track(CRUISE, 0.0), [car("stands", track(np.full(N, 40.0), 0.0))]), "ncap")
+    assert whole["ncap_score"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_a_scene_does_not_know_is_not_measured_and_never_zero():
+    log = rollout(track(CRUISE, 0.0))
+    bare = values(log, "nuplan", replace(TWO_LANES, lanes={}, road_edges=()))
+    assert bare["nuplan_drivable_area"] == bare["nuplan_driving_direction"] == "not measured: a map"
+    assert "standing obstacles" in values(log, "nuplan", standing="unknown")["nuplan_no_at_fault_collision"]
+    assert values(replace(log, force_gt_us=10**9), "nuplan")["nuplan_score"].startswith("the policy never took over")
+
+
+def test_every_part_and_score_is_declared():
+    assert set(PROTOCOLS) == set(SCORES) == set(PARTS)
+    log = plans(rollout(track(CRUISE, 0.0)), 16.0)
+    for name, protocol in PROTOCOLS.items():
+        assert set(protocol.scores) == set(SCORES[name])
+        assert {f"{name}_{part}" for part in PARTS[name]} <= set(values(log, name))
+
+
