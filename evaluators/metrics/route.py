@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, interpolate, offset_trajectory
-from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.footprint import ego_footprints, held, origin_of
 from evaluators.metrics.presets import PRESETS, Preset
 from evaluators.metrics.score import relevant, series, with_preset
@@ -48,7 +48,7 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
 
 
 def moving(path: F64) -> I64:
-    """Return which vertices of a path ``(N, 2)`` remain when it stands at neither end: the ends, and what lies beyond `STAND_M` from them."""
+    """Return which vertices of a path ``(N, 2)`` remain when it stands at neither end: the ends, and those beyond `STAND_M` of them."""
     away = [np.hypot(*(path - end).T) > STAND_M for end in (path[0], path[-1])]
     if not (away[0].any() and away[1].any()):
         return np.zeros(1, dtype=np.int64)

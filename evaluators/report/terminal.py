@@ -41,22 +41,19 @@ def render_presets(summaries: Mapping[str, Mapping[str, Any]], known: MetricTabl
         table.add_column(Text(escape(head)), overflow="fold")
     for preset, summary in summaries.items():
         for name in [f"{preset}_{score}" for score in SCORES.get(preset, {})] or known.headline:
-            cells = [_score_cell((summary.get("metrics") or {}).get(variant, {}), name, known.shown(name).in_percent) for variant in columns]
-            table.add_row(preset, name, *cells)
+            table.add_row(preset, name, *(_score_cell(summary, variant, name, known.shown(name).in_percent) for variant in columns))
     return table
 
 
-def _score_cell(metrics: Mapping[str, Mapping[str, Any]], name: str, in_percent: bool) -> Text:
-    def text(value: float) -> str:
-        return f"{100 * value:.1f} %" if in_percent else f"{value:.3f}"
-
-    one, least, most = (metrics.get(name + end) or {} for end in ("", "_least", "_most"))
-    if one.get("mean") is not None and not one.get("n_invalid"):
-        return Text(text(one["mean"]))
-    reason = Text(escape(str(one.get("reason") or f"not measured in {one.get('n_invalid', 'any')} of the rollouts")), style="dim")
-    if least.get("mean") is None or most.get("mean") is None:
-        return reason
-    return Text(f"{text(least['mean'])} to {text(most['mean'])} ").append_text(reason)
+def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent: bool) -> Text:
+    metrics = (summary.get("metrics") or {}).get(variant) or {}
+    means = [(metrics.get(name + end) or {}).get("mean") for end in ("", "_least", "_most")]
+    why = ((summary.get("censoring") or {}).get(variant) or {}).get("invalid", {}).get(name, {}).get("reasons", {})
+    texts = ["" if mean is None else f"{100 * mean:.1f} %" if in_percent else f"{mean:.3f}" for mean in means]
+    reason = Text(escape("; ".join(why) or ("" if texts[0] else "not measured")), style="dim")
+    if not why or not texts[1]:  # known in all rollouts, or without a range
+        return Text(f"{texts[0]} ").append_text(reason)
+    return Text(f"{texts[1]} to {texts[2]} ").append_text(reason)
 
 
 def render_table(summary: Mapping[str, Any], headline_only: bool = False, known: MetricTable = METRICS) -> Table:

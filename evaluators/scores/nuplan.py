@@ -6,6 +6,7 @@ nuplan-devkit. All angles are radians, all lengths metres; what the devkit calls
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -162,7 +163,7 @@ def motion(ego: EgoStates) -> dict[str, F64]:
 
 def uncomfortable(series: dict[str, F64]) -> Bool:
     """Return where ``(T,)`` one of the bounds of comfort is broken, from what `motion` gives."""
-    return np.any([(series[name] < low) | (series[name] > high) for name, (low, high) in COMFORT.items()], axis=0)
+    return np.asarray(np.any([(series[name] < low) | (series[name] > high) for name, (low, high) in COMFORT.items()], axis=0))
 
 
 def progress_ratio(ego_m: float, expert_m: float) -> float:
@@ -181,7 +182,7 @@ def direction_score(against_m: float) -> float:
     return 1.0 if against_m < AGAINST_M else 0.5 if against_m < FAR_AGAINST_M else 0.0
 
 
-def closed_loop_score(parts: dict[str, float]) -> float:
+def closed_loop_score(parts: Mapping[str, float]) -> float:
     """Return the product of the multipliers and the weighted mean of the others.
 
     >>> closed_loop_score({**dict.fromkeys(MULTIPLIERS, 1.0), **dict.fromkeys(WEIGHTS, 1.0), "comfort": 0.0})

@@ -43,13 +43,14 @@ def _of(benchmark: str) -> dict[str, MetricInfo]:
     limits, out = (0.0, MOST.get(benchmark, 1.0)), {}
     for name, text in SCORES[benchmark].items():
         for end, which in (("", ""), ("_least", "; nothing for what is not measured"), ("_most", "; full marks for what is not measured")):
-            out[f"{benchmark}_{name}{end}"] = MetricInfo("", "higher", "last", text + which, limits=limits, invalid="a part is not measured")
+            unknown = "never" if end else "a part is not measured that would decide"
+            out[f"{benchmark}_{name}{end}"] = MetricInfo("", "higher", "last", text + which, limits=limits, invalid=unknown)
     for name, text in PARTS[benchmark].items():
-        missing = {"invalid": "[what it reads is not there](presets.md#other-benchmarks)"}
         if name.endswith("_mps"):
             out[f"{benchmark}_{name}"] = MetricInfo("m/s", "lower", "last", text, limits=(0.0, None), invalid="no contact")
         else:
-            out[f"{benchmark}_{name}"] = MetricInfo("", "higher", "last", text, limits=limits, **missing)
+            unknown = "[what it reads is not there](presets.md#other-benchmarks)"
+            out[f"{benchmark}_{name}"] = MetricInfo("", "higher", "last", text, limits=limits, invalid=unknown)
     return out
 
 

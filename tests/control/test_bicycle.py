@@ -89,7 +89,9 @@ def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_w
 
     truth = drive(2e-4)
     errors = [error_m(drive(h), truth) for h in (0.05, 0.025, 0.01)]
-    assert errors[0] < 2e-5 and errors[1] < errors[0] / 8 and errors[2] < errors[1] / 20, errors
+    assert errors[0] < 2e-5
+    assert errors[1] < errors[0] / 8
+    assert errors[2] < errors[1] / 20
 
 
 def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can() -> None:

@@ -19,7 +19,8 @@ CRUISE = np.linspace(0.0, 63.2, N)  # 8 m/s
 
 def values(log, preset, where=TWO_LANES, **more):
     one = replace(scene(where, log), **more)
-    return {name: found.value if found.valid else found.reason for name, found in reduce_rollout(score(log, one, preset), preset).values.items()}
+    found = reduce_rollout(score(log, one, preset), preset).values
+    return {name: value.value if value.valid else value.reason for name, value in found.items()}
 
 
 def braking(at=40.0, to=20.0):
@@ -131,5 +132,3 @@ def test_every_part_and_score_is_declared():
     for name, protocol in PROTOCOLS.items():
         assert set(protocol.scores) == set(SCORES[name])
         assert {f"{name}_{part}" for part in PARTS[name]} <= set(values(log, name))
-
-

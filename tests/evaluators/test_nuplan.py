@@ -15,7 +15,8 @@ FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtur
 FILES = sorted(FIXTURES.glob("*/*.json"))
 WIDTH_M, FRONT_M, REAR_M = 2.297, 4.049, 1.127  # of the devkit's vehicle, from its rear axle
 SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_rate")} | {
-    "ego_acceleration": "accel", "ego_lon_acceleration": "lon_accel", "ego_lat_acceleration": "lat_accel", "ego_yaw_acceleration": "yaw_accel",
+    "ego_acceleration": "accel", "ego_lon_acceleration": "lon_accel", "ego_lat_acceleration": "lat_accel",
+    "ego_yaw_acceleration": "yaw_accel",
 }  # fmt: skip
 
 
