@@ -44,7 +44,7 @@ STRIP_NAME, VIDEO_NAME, MANIFEST = "strip.jpg", "front.mp4", "manifest.json"
 LOCK, RUN_INFO, CONTENTS, SUMMARY, ROLLOUTS, STEPS = (
     ".simrun.lock", "run.json", "contents.json", "summary.json", "rollouts.parquet", "steps.parquet"
 )  # fmt: skip
-SCENES, ROLLOUTS_FOLDER, AGGREGATE, PROBES = "scenes", "rollouts", "aggregate", "probes"
+SCENES, ROLLOUTS_FOLDER, AGGREGATE, PROBES, WHY = "scenes", "rollouts", "aggregate", "probes", "why"
 PAGES = ("report.html", "flips.html")
 REPORTS = (*PAGES, "summary.md", "junit.xml")  # made from the tables; nothing reads them
 PROBE_JSON, PROBE_TABLE, PROBE_PLOT = "probe.json", "probe.parquet", "probe.png"
@@ -75,6 +75,7 @@ RUN_FILES = (
     File("view.html", "drives side by side", "command", is_required=False),
     File(f"{PROBES}/", "probes of logged rollouts", "command", is_required=False),
     File("forks/", "forks of logged rollouts", "command", is_required=False),
+    File(f"{WHY}/", "pages that show why a drive failed", "command", is_required=False),
 )
 TABLES = tuple(file.name for file in RUN_FILES if file.made_by == "tables")  # made from the manifests
 DRIVEN = tuple(file.name for file in ROLLOUT_FILES if file.made_by == "drive")  # only driving makes them

@@ -172,6 +172,7 @@ def drive_data(
         "renderer": rollout.renderer,
         "ego": ego,
         "size": [round(100 * side) for side in size_m],
+        "rear": 0 if log is None else round(100 * float(log.T_rig_box[0, 3])),
         "users": _road_users(log, content, place, tracks),
         "as_driven": log is not None,
         "plans": [] if log is None else [_plan(plan, place) for plan in log.plans],
@@ -196,10 +197,8 @@ def _ego(log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], pl
 
 def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks) -> list[int]:
     if log is not None:
-        return [
-            tracks.add(_user(actor.actor_id, actor.label, (actor.box.length_m, actor.box.width_m), place.track(actor.track)))
-            for actor in log.actors.values()
-        ]
+        boxes = {a.actor_id: (a.box.length_m, a.box.width_m, a.box.height_m) for a in log.actors.values()}
+        return [tracks.add(_user(a.actor_id, a.label, boxes[a.actor_id], place.track(a.track))) for a in log.actors.values()]
     found = []
     for actor in content.get("actors") or []:
         if actor.get("x_m") and actor.get("length_m"):
@@ -209,7 +208,7 @@ def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place
     return found
 
 
-def _user(name: str, label: str, size_m: tuple[float, float], way: dict[str, list[int]]) -> dict[str, Any]:
+def _user(name: str, label: str, size_m: tuple[float, ...], way: dict[str, list[int]]) -> dict[str, Any]:
     if len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1:  # it stands: two poses say when it is there
         way = {key: [values[0], values[-1]] for key, values in way.items()}
     return {"id": name, "label": label or "other", "size": [round(100 * side) for side in size_m], **way}

@@ -162,18 +162,17 @@ def render(index: str, documents: Mapping[str, str], live: bool = False) -> str:
         documents: Cell id -> JSON of `cell_data`.
         live: The page asks its own server for documents.
     """
+    filled = {name: Markup(text) for name, text in documents.items()}
+    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=filled, live=live)
+
+
+def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
+    """Fill a template of a page that holds its scripts and styles and allows no others."""
     environment = _environment()
-    script = "\n".join(asset(environment, name) for name in SCRIPTS)
-    style = "\n".join(asset(environment, name) for name in STYLES)
-    return environment.get_template("viewer.html.j2").render(
-        style=Markup(style),
-        style_hash=_sha256(style),
-        script=Markup(script),
-        script_hash=_sha256(script),
-        index=Markup(index),
-        documents={name: Markup(text) for name, text in documents.items()},
-        live=live,
-    )
+    script = "\n".join(asset(environment, name) for name in scripts)
+    style = "\n".join(asset(environment, name) for name in styles)
+    own = {"style": Markup(style), "style_hash": _sha256(style), "script": Markup(script), "script_hash": _sha256(script)}
+    return environment.get_template(template).render(**own, **values)
 
 
 @cache

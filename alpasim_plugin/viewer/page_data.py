@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError, SimrunError
-from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
@@ -74,6 +74,10 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
             drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
+            known = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
+            for one in drive["cameras"]:
+                if one["name"] in known:
+                    one["lens"] = lens_data(known[one["name"]], one["width"])
             drive["no_frames"] = "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
         drives.append(drive)
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
@@ -85,7 +89,16 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
         "parts": plans_part(_flip_entries(run, cell), place),
         "end": max([*ends, 1]),
         "warmup": round(int(content.get("warmup_us") or 0) / 1000),
+        "origin": place.origin.tolist(),
+        "zero_us": place.zero_us,
     }
+
+
+def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
+    """Return what projects rig coordinates into a picture of at most this width: fx, fy, cx, cy, and the mounting, 3 rows of 4."""
+    scale = min(1.0, width_px / camera.width)
+    k = [round(float(camera.K[at]) * scale, 3) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
 
 
 def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
