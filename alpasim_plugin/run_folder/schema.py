@@ -40,11 +40,11 @@ class File:
 
 
 LOG_NAME, FRAMES_NAME, OUTPUT_NAME, STEPS_NAME = "rollout.asl", "frames.jsonl", "output.log", "steps.parquet"
-STRIP_NAME, VIDEO_NAME, MANIFEST = "strip.jpg", "front.mp4", "manifest.json"
+STRIP_NAME, VIDEO_NAME, MANIFEST, WHY_NAME = "strip.jpg", "front.mp4", "manifest.json", "why.html"
 LOCK, RUN_INFO, CONTENTS, SUMMARY, ROLLOUTS, STEPS = (
     ".simrun.lock", "run.json", "contents.json", "summary.json", "rollouts.parquet", "steps.parquet"
 )  # fmt: skip
-SCENES, ROLLOUTS_FOLDER, AGGREGATE, PROBES, WHY = "scenes", "rollouts", "aggregate", "probes", "why"
+SCENES, ROLLOUTS_FOLDER, AGGREGATE, PROBES = "scenes", "rollouts", "aggregate", "probes"
 PAGES = ("report.html", "flips.html")
 REPORTS = (*PAGES, "summary.md", "junit.xml")  # made from the tables; nothing reads them
 PROBE_JSON, PROBE_TABLE, PROBE_PLOT = "probe.json", "probe.parquet", "probe.png"
@@ -56,6 +56,7 @@ ROLLOUT_FILES = (
     File(STEPS_NAME, "its rows of the run's steps.parquet", "score"),
     File(STRIP_NAME, "a few frames", "drive", is_required=False),
     File(VIDEO_NAME, "the video, on request", "drive", is_required=False),
+    File(WHY_NAME, "of a drive that failed: the page that shows why", "report", is_required=False),
     File(MANIFEST, "what it is, how it went, and the digests of the other files", "end"),
 )
 RUN_FILES = (
@@ -75,7 +76,6 @@ RUN_FILES = (
     File("view.html", "drives side by side", "command", is_required=False),
     File(f"{PROBES}/", "probes of logged rollouts", "command", is_required=False),
     File("forks/", "forks of logged rollouts", "command", is_required=False),
-    File(f"{WHY}/", "pages that show why a drive failed", "command", is_required=False),
 )
 TABLES = tuple(file.name for file in RUN_FILES if file.made_by == "tables")  # made from the manifests
 DRIVEN = tuple(file.name for file in ROLLOUT_FILES if file.made_by == "drive")  # only driving makes them

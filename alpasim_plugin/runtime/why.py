@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,15 +20,14 @@ from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.probe import PolicyQuery, compare, replay
 from alpasim_plugin.runtime.trials import Changed, Findings, Trial, Tried, investigate
-from alpasim_plugin.viewer.cause import Cause, Look, Parting
+from alpasim_plugin.viewer.cause import Cause, Look, Parting, chosen, commands, failed_at, half_seconds, sentence
+from alpasim_plugin.viewer.drive_data import MAX_SAMPLES
 from evaluators.metrics.outcomes import OUTCOMES, in_words
 from evaluators.metrics.plan import first_divergence
 from evaluators.opening import Run
 from evaluators.report.flips import baseline_of
 
 DOING = "finding why a drive failed"
-BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
-MOST_LOOKS = 48
 MOST_DRIVES = 3
 SLOW_US = 150_000  # a policy that answers later than this has a latency of its own
 Say = Callable[[str], None]
@@ -68,7 +66,7 @@ def explain(past: LoggedRollout, run: Run, say: Say) -> Cause:
             raise
         notes.append(f"Other renderers cannot be shown at the same poses: {error.found}.")
         queries = replay(past)
-    failed_us = min((int(event["t_us"]) for event in past.manifest["events"] if event["metric"] in OUTCOMES), default=None)
+    failed_us = failed_at(past.manifest)
     until = [one for one in queries if failed_us is None or one.t_us <= failed_us]
     say("trying changes of what the policy sees and answers")
     findings = investigate(
@@ -86,12 +84,12 @@ def explain(past: LoggedRollout, run: Run, say: Say) -> Cause:
         outcome=in_words(_outcomes(past.manifest)),
         failed_us=failed_us,
         start_us=past.scenario.start_us,
-        looks=tuple(_looks(queries, failed_us)),
+        looks=_looks(queries, own, failed_us),
         sentences=tuple(_sentences(findings, driven, partings, past.scenario.start_us, failed_us)),
         tried=_tried(findings, driven),
         depends=[(one.what, "yes" if one.is_used else "no", f"{one.apart_m:.2f} m") for one in findings.depends],
         partings=tuple(partings),
-        commands=tuple(_commands(past, run, failed_us, partings)),
+        commands=commands(run, rollout, past.scenario.start_us, failed_us, partings),
         notes=tuple(notes),
     )
 
@@ -102,12 +100,18 @@ def _outcomes(manifest: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(name for name in OUTCOMES if (values.get(name) or {}).get("valid") and values[name]["value"] >= 0.5)
 
 
-def _looks(queries: Sequence[PolicyQuery], failed_us: int | None) -> list[Look]:
+def _looks(queries: Sequence[PolicyQuery], own: str, failed_us: int | None) -> list[Look]:
     """Return the queries that the page shows: those before the failure, or an even choice of the whole drive."""
-    near = [q for q in queries if failed_us is None or failed_us - BEFORE_US <= q.t_us <= failed_us + AFTER_US]
-    stride = -(-len(near) // MOST_LOOKS)
-    kept = near[::-1][::stride][::-1]
-    return [Look(q.observation, q.plans, q.frames) for q in kept]
+    found = []
+    for query in chosen(queries, failed_us, [one.t_us for one in queries]):
+        o = query.observation
+        plans = {
+            name: [half_seconds(plan.times_us, one) for one in (plan.xy, *plan.samples[:MAX_SAMPLES])] for name, plan in query.plans.items()
+        }
+        frames = {name: (frame.t_us, frame.rgb) for name, frame in query.frames.items()}
+        debug = query.plans[own].debug
+        found.append(Look(query.t_us, o.ego.T_world_rig, o.ego.speed_mps, o.route_rig[:, :2], plans, frames, debug))
+    return found
 
 
 def _tried(findings: Findings, driven: Sequence[Driven]) -> list[tuple[str, str, str]]:
@@ -178,12 +182,8 @@ def _sentences(
     out = [("shown", f"With {one.trial.name} the drive ends without an event: {one.trial.cause}.") for one in driven if one.mends]
     out += _about_pictures(findings, start_us)
     for one in partings:
-        by, same = f"{one.kind} {one.name}", "at the same poses " if one.kind == "renderer" else ""
-        if one.t_us is not None:
-            at = f"at {(one.t_us - start_us) * 1e-6:.1f} s, by {one.gap_m:.2f} m"
-            out.append(("seen", f"{same}plans part from those of the {by} {at}."))
-        elif same:
-            out.append(("seen", f"the pictures are not the cause: {same}plans behind {one.name} are the same within {one.gap_m:.2f} m."))
+        same = one.kind == "renderer" and one.t_us is None
+        out.append(("seen", f"the pictures are not the cause. {sentence(one, start_us)[1]}") if same else sentence(one, start_us))
     for used in findings.depends:
         if not used.is_used and "picture" not in used.what:
             out.append(("seen", f"its plans do not depend on the {used.what.split(',')[0]}."))
@@ -209,16 +209,3 @@ def _about_pictures(findings: Findings, start_us: int) -> list[tuple[str, str]]:
         first, last = ((t_us - start_us) * 1e-6 for t_us in (max(one.t_us for one in heard), min(one.t_us for one in deaf)))
         out.append(("shown", f"between {first:.1f} and {last:.1f} s its plans stop to react to pictures, as if one were frozen."))
     return out
-
-
-def _commands(past: LoggedRollout, run: Run, failed_us: int | None, partings: Sequence[Parting]) -> list[tuple[str, str, str]]:
-    """Return what can be asked next: a key, what it shows, the command."""
-    root, name = shlex.quote(str(run.folder)), shlex.quote(past.name)
-    parted = next((one.t_us for one in partings if one.t_us is not None), failed_us or past.scenario.start_us)
-    at = max(0.0, (parted - past.scenario.start_us) * 1e-6)
-    other = next((one.name for one in partings if one.kind == "renderer"), "clean" if past.cell.renderer.name != "clean" else "3dgs")
-    return [
-        ("f", "drive on from there behind another renderer", f"simrun fork {root} --cell {name} --at {at:.1f} --renderer {other}"),
-        ("p", "plans at the same poses behind both", f"simrun probe {root} --cell {name} --renderers {other},{past.cell.renderer.name}"),
-        ("v", "watch the drive", f"simrun view {shlex.quote(str(past.folder))}"),
-    ]

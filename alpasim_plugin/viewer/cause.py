@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -14,23 +15,29 @@ import numpy.typing as npt
 from markupsafe import Markup
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import transform_points
-from alpasim_plugin.core.types import F64, U8, CameraSpec, Frame, Observation, Plan
+from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
+from alpasim_plugin.core.types import F64, I64, U8, RolloutLog
 from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.log import decode_image, read_asl
 from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import WHY, rollout_folder
+from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
 from alpasim_plugin.viewer.cells import Wanted, cells_of
 from alpasim_plugin.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from alpasim_plugin.viewer.page import as_json, fill
 from alpasim_plugin.viewer.page_data import cell_data, lens_data, read_logs
 from alpasim_plugin.viewer.pictures import jpeg, smaller
+from evaluators.metrics.outcomes import OUTCOMES, in_words, outcomes_of
 from evaluators.opening import Run
 
 DOING = "writing the page of a cause"
 WIDTH_PX = 640
+JPEG_START = b"\xff\xd8"
+BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
+MOST_LOOKS = 48
 CROP_SHARE = 3  # the crop is a third as wide and as high as the picture
 SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -38,14 +45,27 @@ class Look:
     """One query of the policy.
 
     Attributes:
-        observation: What it saw behind its own renderer.
-        plans: Its plan behind each renderer at that pose.
-        frames: What each renderer showed it: of its first camera.
+        T_world_rig: ``(4, 4)``: where the ego was.
+        speed_mps: Along the rig.
+        route: ``(N, 2)`` metres, rig frame, as it was given; empty where that is not known.
+        plans: Behind each renderer at that pose: the plan and its samples, each ``(N, 2)`` metres, rig frame, every half second.
+        frames: What each renderer showed of the first camera: time, and ``(H, W, 3)`` or its JPEG.
+        debug: What the policy said of itself, `Plan.debug`.
     """
 
-    observation: Observation
-    plans: Mapping[str, Plan]
-    frames: Mapping[str, Frame]
+    t_us: int
+    T_world_rig: F64
+    speed_mps: float
+    route: F64
+    plans: Mapping[str, Sequence[F64]]
+    frames: Mapping[str, tuple[int, U8 | bytes]]
+    debug: Mapping[str, Any]
+
+
+def half_seconds(times_us: I64, xy: F64) -> F64:
+    """Return positions ``(T, 2+)`` every half second ``(N, 2)``, on which the page counts."""
+    at = np.arange(times_us[0], times_us[-1] + 1, PLAN_STEP_US)
+    return np.stack([np.interp(at, times_us, xy[:, k]) for k in (0, 1)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -97,28 +117,26 @@ class Cause:
     notes: Sequence[str] = ()
 
 
-def page_of(rollout: Rollout) -> str:
-    """Return the path of a rollout's page below its run folder."""
-    return Path(WHY, *rollout_folder(*rollout.cell).parts[1:]).with_suffix(".html").as_posix()
-
-
 def write_cause(run: Run, cause: Cause) -> Path:
-    """Write the page of a drive and return its path.
+    """Write the page into the folder of the rollout and return its path.
 
     Raises:
         InputError: The run has no map of the scene.
         InfrastructureError: The disk refuses.
     """
-    path = run.folder / page_of(cause.rollout)
-    up = "../" * (len(path.relative_to(run.folder).parts) - 1)
     rollout = cause.rollout
+    path = run.folder / rollout.path / WHY_NAME
+    report = "../" * len(Path(rollout.path).parts) + "report.html"
     cell = cells_of(run, Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,)))[0]
-    document = cell_data(run, cell, read_logs(run, cell), None)
+    logs = read_logs(run, cell)
+    document = cell_data(run, cell, logs, None)
     place = Place(np.array(document.pop("origin")), document.pop("zero_us"))
     document |= {"failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0], "own": rollout.renderer}
-    document |= {"looks": [_look(look, rollout.renderer, place) for look in cause.looks], "index": {"renderers": run.renderers}}
-    first = next((look.observation for look in cause.looks if look.frames), None)
-    document["lens"] = None if first is None else lens_data(_camera(first), WIDTH_PX)
+    log = next(iter(logs.values()))
+    camera = next(iter(log.info["cameras"]), None) if isinstance(log, RolloutLog) else None
+    scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
+    document |= {"looks": [_look(look, place, scale) for look in cause.looks]}
+    document["lens"] = None if camera is None else lens_data(camera, WIDTH_PX)
     html = fill(
         "cause.html.j2",
         SCRIPTS,
@@ -127,46 +145,33 @@ def write_cause(run: Run, cause: Cause) -> Path:
         document=Markup(as_json(document)),
         partings=[_parting(one, cause.start_us) for one in cause.partings],
         run=run.folder.resolve().name,
-        report=f"{up}report.html" if (run.folder / "report.html").is_file() else "",
+        report=report,
         failed_s=None if cause.failed_us is None else (cause.failed_us - cause.start_us) * 1e-6,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, html, DOING)
     return path
 
 
-def _camera(observation: Observation) -> CameraSpec:
-    return next(iter(observation.cameras.values()))
-
-
-def _look(look: Look, renderer: str, place: Place) -> dict[str, Any]:
+def _look(look: Look, place: Place, scale: float) -> dict[str, Any]:
     """Return a query for the page: times in milliseconds, lines in world centimetres, pictures as JPEG."""
-    o = look.observation
-    T = o.ego.T_world_rig
 
     def line(xy: F64) -> list[list[int]]:
-        """Return rig coordinates ``(N, 2+)`` in world centimetres, without rows of NaN."""
-        known = np.asarray(xy, dtype=np.float64)[:, :2]
-        known = known[np.isfinite(known).all(axis=1)]
-        return place.cm(transform_points(T, np.column_stack([known, np.zeros(len(known))]))[:, :2])
+        """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
+        known = xy[np.isfinite(xy).all(axis=1)]
+        return place.cm(transform_points(look.T_world_rig, np.column_stack([known[:, :2], np.zeros(len(known))]))[:, :2])
 
-    def plan(given: Plan) -> dict[str, Any]:
-        """Return a plan and its samples every half second, which the page counts on."""
-        at = np.arange(given.times_us[0], given.times_us[-1] + 1, PLAN_STEP_US)
-        lines = (given.xy, *given.samples[:MAX_SAMPLES])
-        return {"lines": [line(np.stack([np.interp(at, given.times_us, one[:, k]) for k in (0, 1)], axis=1)) for one in lines]}
+    def picture(frame: U8 | bytes) -> str:
+        if isinstance(frame, bytes) and scale == 1.0 and frame.startswith(JPEG_START):
+            return base64.b64encode(frame).decode()
+        return jpeg(smaller(decode_image(frame, "a camera frame") if isinstance(frame, bytes) else frame, WIDTH_PX))
 
-    own = look.plans.get(renderer)
-    camera = _camera(o) if o.cameras else None
-    seen = {name: {"jpeg": jpeg(smaller(f.rgb, WIDTH_PX)), "t": place.ms([f.t_us])[0]} for name, f in look.frames.items()}
-    scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
     return {
-        "t": place.ms([o.t_us])[0],
-        "speed": round(o.ego.speed_mps, 2),
-        "route": line(o.route_rig),
-        "plans": {name: plan(given) for name, given in look.plans.items()},
-        "seen": seen,
-        "said": said(own.debug if own else {}, scale, line),
+        "t": place.ms([look.t_us])[0],
+        "speed": round(look.speed_mps, 2),
+        "route": line(look.route),
+        "plans": {name: {"lines": [line(one) for one in lines]} for name, lines in look.plans.items()},
+        "seen": {name: {"jpeg": picture(frame), "t": place.ms([t_us])[0]} for name, (t_us, frame) in look.frames.items()},
+        "said": said(look.debug, scale, line),
     }
 
 
@@ -192,9 +197,9 @@ def said(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
                 out["boxes"] += [[str(name), *(round(float(v) * scale, 1) for v in row)] for row in array]
                 continue
             if name.startswith("line") and array.ndim == 2 and array.shape[1] >= 2:
-                out["lines"].append([str(name), line(array)])
+                out["lines"].append([str(name), line(array[:, :2].astype(np.float64))])
                 continue
-            if array.ndim == 2 and min(array.shape) >= 4:
+            if array.ndim == 2 and min(array.shape) >= 4 and np.isfinite(array).any():
                 out["heat"].append([str(name), heat_png(array), *(f"{v:.3g}" for v in (np.nanmin(array), np.nanmax(array)))])
                 continue
         out["text"].append([str(name), _words(value, array)])
@@ -221,6 +226,94 @@ def heat_png(values: npt.NDArray[Any]) -> str:
     if not done:
         raise InputError(DOING, f"heat map {values.shape}", "the encoder refused", "give a smaller one")
     return base64.b64encode(png.tobytes()).decode()
+
+
+# --- from a log alone -----------------------------------------------------------------------------------------------
+
+
+def failed_at(manifest: Mapping[str, Any]) -> int | None:
+    """Return when a drive failed first, microseconds; None where it did not."""
+    return min((int(event["t_us"]) for event in manifest.get("events") or () if event["metric"] in OUTCOMES), default=None)
+
+
+def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:
+    """Return at most `MOST_LOOKS` of what has these times: what lies before the failure, or an even choice."""
+    near = [one for one, t in zip(all_of, times_us, strict=True) if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US]
+    return near[::-1][:: -(-len(near) // MOST_LOOKS) or 1][::-1]
+
+
+def looks_of(log: RolloutLog, renderer: str, failed_us: int | None) -> list[Look]:
+    """Return the queries of a log that the page shows, with what the log holds of them."""
+    camera = next(iter(log.info["cameras"]), None)
+    images = [image for image in log.images if camera is not None and image.camera == camera.name]
+    ends, found = np.array([image.end_us for image in images]), []
+    moved = np.hypot(*np.gradient(log.ego.xyz[:, :2], (log.ego.t_us - log.ego.t_us[0]) * 1e-6, axis=0).T)
+    plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
+    for plan in chosen(plans, failed_us, [one.now_us for one in plans]):
+        pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
+        lines = [half_seconds(one.t_us, transform_points(inverse(pose), one.xyz)) for one in (plan.trajectory, *plan.samples[:MAX_SAMPLES])]
+        newest = int(np.searchsorted(ends, plan.now_us, "right")) - 1
+        seen = {renderer: (images[newest].end_us, images[newest].data)} if newest >= 0 else {}
+        speed = float(np.interp(plan.now_us, log.ego.t_us, moved))
+        found.append(Look(plan.now_us, pose, speed, np.zeros((0, 2)), {renderer: lines}, seen, {}))
+    return found
+
+
+def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) -> Cause | None:
+    """Return what the files of a run say of how a drive failed; None without a log.
+
+    Args:
+        run: The run.
+        rollout: One that ended with an event.
+        told: Entries of ``flips.json`` about it: when its plans part from those of others.
+    """
+    path = run.file_of(rollout, LOG_NAME)
+    if path is None:
+        return None
+    log, failed_us = read_asl(path), failed_at(run.manifest(rollout))
+    partings = []
+    for entry in told:
+        kind = "renderer" if entry["baseline"] != rollout.renderer else "policy"
+        name = str(entry["baseline"]) if kind == "renderer" else str(entry["against"]).removeprefix(rollout.renderer + "/")
+        files = [run.folder / one for one in (entry.get("frames") or {}).values()]
+        frames = [decode_image(file.read_bytes(), str(file)) for file in files if kind == "renderer" and file.is_file()]
+        pair = (frames[0], frames[1]) if len(frames) == 2 and frames[0].shape == frames[1].shape else None
+        if entry.get("t_us") is not None:
+            partings.append(Parting(name, kind, int(entry["t_us"]), float(entry["gap_m"]), pair))
+    return Cause(
+        rollout=rollout,
+        outcome=in_words(outcomes_of(rollout)),
+        failed_us=failed_us,
+        start_us=log.render_start_us,
+        sentences=[sentence(one, log.render_start_us) for one in partings],
+        looks=looks_of(log, rollout.renderer, failed_us),
+        tried=[],
+        depends=[],
+        partings=partings,
+        commands=commands(run, rollout, log.render_start_us, failed_us, partings),
+    )
+
+
+def sentence(one: Parting, start_us: int) -> tuple[str, str]:
+    """Say when plans part, and how sure that is."""
+    if one.t_us is None:
+        return "seen", f"Plans never part from those of the {one.kind} {one.name}: they are the same within {one.gap_m:.2f} m."
+    at_s = (one.t_us - start_us) * 1e-6
+    return "seen", f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m."
+
+
+def commands(run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]) -> list[tuple[str, str, str]]:
+    """Return what can be asked next: a key, what it shows, the command."""
+    root, name = shlex.quote(str(run.folder)), shlex.quote(cell_name(*rollout.cell))
+    parted = next((one.t_us for one in partings if one.t_us is not None), failed_us or start_us)
+    own, at = rollout.renderer, max(0.0, (parted - start_us) * 1e-6)
+    other = next((one.name for one in partings if one.kind == "renderer"), "clean" if own != "clean" else "3dgs")
+    return [
+        ("w", "try single changes of what the policy sees and answers", f"simrun why {shlex.quote(str(run.folder / rollout.path))}"),
+        ("f", f"drive on from there behind {other}", f"simrun fork {root} --cell {name} --at {at:.1f} --renderer {other}"),
+        ("p", "compare plans at the same poses", f"simrun probe {root} --cell {name} --renderers {other},{own}"),
+        ("v", "watch the drive", f"simrun view {shlex.quote(str(run.folder / rollout.path))}"),
+    ]
 
 
 # --- where plans part -----------------------------------------------------------------------------------------------

@@ -169,7 +169,6 @@ def drive_data(
     manifest = run.manifest(rollout)
     ego, size_m = _ego(log, steps, content, place)
     return {
-        "renderer": rollout.renderer,
         "ego": ego,
         "size": [round(100 * side) for side in size_m],
         "rear": 0 if log is None else round(100 * float(log.T_rig_box[0, 3])),
@@ -284,14 +283,21 @@ def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, An
     return found[:MAX_FRAME_EVENTS]
 
 
-def plans_part(flips: Sequence[Mapping[str, Any]], place: Place) -> list[dict[str, Any]]:
-    """Return when plans first diverged, of entries of ``flips.json``."""
+def plans_part(flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool) -> list[dict[str, Any]]:
+    """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in `WatchedCell`."""
+
+    def sides(entry: Mapping[str, Any]) -> tuple[str, str]:
+        """Return what the two are called."""
+        if by_policy:
+            return str(entry["policy"]), str(entry["against"]).removeprefix(f"{entry['renderer']}/")
+        return str(entry["renderer"]), str(entry["baseline"])
+
     return [
         {
             "t": round((int(entry["t_us"]) - place.zero_us) / 1000),
             "kind": "plans",
-            "text": f"plans part by {float(entry['gap_m']):.2f} m from {entry['baseline']}",
-            "renderer": entry["renderer"],
+            "text": f"plans part by {float(entry['gap_m']):.2f} m from {sides(entry)[1]}",
+            "renderer": sides(entry)[0],
         }
         for entry in flips
         if entry.get("t_us") is not None

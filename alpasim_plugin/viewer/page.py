@@ -105,7 +105,7 @@ def names(cells: Iterable[WatchedCell], at_most: int = 12) -> str:
 
 MB = 1_000_000
 DEFAULT_MB = 15.0  # megabytes, not mebibytes
-SCRIPTS = ("theme.js", "timeline.js", "cameras.js", "birdseye.js", "curves.js", "moments.js", "player.js")
+SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cameras.js", "birdseye.js", "curves.js", "moments.js", "player.js")
 STYLES = ("theme.css", "viewer.css")
 
 
@@ -254,7 +254,7 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
         InfrastructureError: The page cannot be written.
     """
     check_wanted(run, wanted)
-    cells = cells_of(run, wanted)
+    cells = cells_of(run, wanted, arms=True)
     if not any(cell.watchable for cell in cells):
         raise InputError(DOING, str(run.folder), "no finished rollout that was asked for", "ask for others; simrun report lists failures")
     with reporting(run):
@@ -274,16 +274,16 @@ def write_flips_page(root: Path) -> Mapping[FlipKey, str]:
         InputError: The run folder is not complete enough to be read.
     """
     run = read_run(root)
-    flipped = telling(cells_of(run))
+    flipped = telling(cells_of(run, arms=True))
     if not flipped:
         (root / FLIPS_PAGE).unlink(missing_ok=True)
         return {}
     with reporting(run):
         page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
     write_text(root / FLIPS_PAGE, page.html, DOING)
-    return {flip.key: f"{FLIPS_PAGE}#{address(cell, flip.other.renderer)}" for cell in page.cells for flip in cell.flips}
+    return {flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}" for cell in page.cells for flip in cell.flips}
 
 
 def address(cell: WatchedCell, renderer: str) -> str:
-    """Return the part of an address that opens a cell with one renderer followed."""
+    """Return the part of an address that opens a cell with one of its drives followed."""
     return urlencode({"scene": cell.scene, "policy": cell.policy, "seed": cell.seed, "renderer": renderer})

@@ -11,7 +11,7 @@ from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import LOG_NAME
+from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
@@ -64,13 +64,14 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
     drives: list[dict[str, Any]] = []
     for rollout in cell.rollouts:
         if not rollout.ok:
-            drives.append({"renderer": rollout.renderer, "failed": f"{rollout.failure_class}: {rollout.failure}"})
+            drives.append({"renderer": cell.side(rollout), "failed": f"{rollout.failure_class}: {rollout.failure}"})
             continue
         log = logs[rollout.path]
         if isinstance(log, SimrunError):
-            drives.append({"renderer": rollout.renderer, "failed": f"its log cannot be read: {log.found}"})
+            drives.append({"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.found}"})
             continue
-        drive = drive_data(run, rollout, log, content, place, tracks)
+        drive = {"renderer": cell.side(rollout)} | drive_data(run, rollout, log, content, place, tracks)
+        drive |= {"why": run.href(rollout, WHY_NAME) or ""}
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
             drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
@@ -86,7 +87,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
         "map": map_data(content, recorded, place),
         "users": tracks.all,
         "drives": drives,
-        "parts": plans_part(_flip_entries(run, cell), place),
+        "parts": plans_part(_flip_entries(run, cell), place, cell.by_policy),
         "end": max([*ends, 1]),
         "warmup": round(int(content.get("warmup_us") or 0) / 1000),
         "origin": place.origin.tolist(),
@@ -125,7 +126,7 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address, or "") and, of a run that goes on,
             ``done`` and ``planned``.
     """
-    ids = {cell.id for cell in here}
+    ids, by_policy = {cell.id for cell in here}, any(cell.by_policy for cell in cells)
     units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}
     metrics = {}
     for name in run.table.ordered({*run.table, *units}):
@@ -133,8 +134,8 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         metrics[name] = {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
     return {
         "run": run.folder.resolve().name,
-        "renderers": run.renderers,
-        "baseline": baseline_of(run),
+        "renderers": run.policies if by_policy else run.renderers,
+        "baseline": next((cell.side(flip.base) for cell in cells for flip in cell.flips), baseline_of(run)),
         "first_curves": run.table.first_curves(),
         "metrics": metrics,
         "cells": [
@@ -146,7 +147,7 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
                 "take": cell.take,
                 "interest": cell.interest,
                 "outcomes": cell.outcomes(),
-                "flips": [{"renderer": flip.other.renderer, "was": flip.was, "now": flip.now, "tone": flip.tone} for flip in cell.flips],
+                "flips": [{"renderer": cell.side(flip.other), "was": flip.was, "now": flip.now, "tone": flip.tone} for flip in cell.flips],
                 "here": cell.id in ids,
             }
             for cell in cells
