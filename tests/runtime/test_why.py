@@ -115,7 +115,7 @@ def test_a_cell_outside_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
     debug = {
-        "picture": np.zeros((8, 8, 3), np.uint8), "heat": np.eye(6), "boxes_cars": np.array([[0, 0, 10, 20]]), 
+        "picture": np.zeros((8, 8, 3), np.uint8), "heat": np.eye(6), "boxes_cars": np.array([[0, 0, 10, 20]]),
         "line_left": np.zeros((5, 2)),
         "speed": 7.25, "mode": "lane", "weights": [0.1, 0.2], "net": object(), "flat": np.ones((5, 5)), "gaps": np.full((4, 4), np.nan),
     }  # fmt: skip
