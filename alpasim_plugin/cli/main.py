@@ -37,7 +37,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "score": "score:score", "compare": "compare:compare", "aggregate": "aggregate:aggregate", "gate": "gate:gate",
         "report": "report:report", "runs": "runs:runs",
     },
-    "Look": {"view": "view:view", "preview": "preview:preview"},
+    "Look": {"why": "why:why", "view": "view:view", "preview": "preview:preview"},
     "AlpaSim": {
         "serve": "serve:serve", "serve-policy": "serve_policy:serve_policy", "check-driver": "check_driver:check_driver",
         "export": "export:export",

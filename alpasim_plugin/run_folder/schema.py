@@ -40,7 +40,7 @@ class File:
 
 
 LOG_NAME, FRAMES_NAME, OUTPUT_NAME, STEPS_NAME = "rollout.asl", "frames.jsonl", "output.log", "steps.parquet"
-STRIP_NAME, VIDEO_NAME, MANIFEST = "strip.jpg", "front.mp4", "manifest.json"
+STRIP_NAME, VIDEO_NAME, MANIFEST, WHY_NAME = "strip.jpg", "front.mp4", "manifest.json", "why.html"
 LOCK, RUN_INFO, CONTENTS, SUMMARY, ROLLOUTS, STEPS = (
     ".simrun.lock", "run.json", "contents.json", "summary.json", "rollouts.parquet", "steps.parquet"
 )  # fmt: skip
@@ -56,6 +56,7 @@ ROLLOUT_FILES = (
     File(STEPS_NAME, "its rows of the run's steps.parquet", "score"),
     File(STRIP_NAME, "a few frames", "drive", is_required=False),
     File(VIDEO_NAME, "the video, on request", "drive", is_required=False),
+    File(WHY_NAME, "of a drive that failed: the page that shows why", "report", is_required=False),
     File(MANIFEST, "what it is, how it went, and the digests of the other files", "end"),
 )
 RUN_FILES = (

@@ -22,7 +22,7 @@ from alpasim_plugin.plugins.interfaces import Policy, Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.process.stdout import parts_print_to_stderr
 from alpasim_plugin.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest
-from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME
+from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME, WHY_NAME
 from alpasim_plugin.run_folder.writer import write_steps
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.runtime.plan import Cell, RunOptions
@@ -104,7 +104,7 @@ def run_cell(
     manifest = _begun(cell) | {"preset": options.preset, "stops_at_path_end": cell.stops_at_path_end, "video": options.video}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (MANIFEST, *DRIVEN, *DERIVED):  # the manifest first: without it nothing is trusted
+        for name in (MANIFEST, *DRIVEN, *DERIVED, WHY_NAME):  # the manifest first: without it nothing is trusted
             (folder / name).unlink(missing_ok=True)
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):

@@ -51,7 +51,8 @@ class PolicyQuery:
 
     t_us: int
     plans: Mapping[str, Plan]
-    frames: Mapping[str, Frame]  # of the policy's first camera
+    frames: Mapping[str, Frame]  # of the policy's first camera; none for a policy without one
+    observation: Observation  # behind the driving renderer
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,10 @@ class _MultiPolicy(Policy):
             policy.reset(seed, route)
 
     def act(self, observation: Observation) -> Plan:
-        latest, camera = self.renderer.latest, self.sensors[0].camera
+        latest = self.renderer.latest
         plans = {name: checked_plan(policy, replace(observation, frames=dict(latest[name]))) for name, policy in self.policies.items()}
-        self.queries.append(PolicyQuery(observation.t_us, plans, {name: latest[name][camera] for name in self.policies}))
+        frames = {name: latest[name][self.sensors[0].camera] for name in self.policies} if self.sensors else {}
+        self.queries.append(PolicyQuery(observation.t_us, plans, frames, observation))
         return plans[self.renderer.driver]
 
 
@@ -145,6 +147,20 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
         raise InputError(DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers")
+    queries = replay(past, renderers)
+    if not queries[0].frames:
+        raise InputError(
+            DOING, past.name, f"the policy {past.cell.policy.name!r} has no camera", "probe a rollout of a policy with cameras"
+        )
+    return Probe(queries, tuple(compare(queries, renderers[0], name) for name in renderers[1:]))
+
+
+def replay(past: LoggedRollout, renderers: Sequence[str] = ()) -> tuple[PolicyQuery, ...]:
+    """Drive a logged rollout again and return its queries, with what these renderers beside its own show at its poses.
+
+    Raises:
+        As `probe_rollout`.
+    """
     past.check_repeatable(DOING)
     own, threads = past.cell, thread_budget(1, 1).per_worker
     specs = {own.renderer.name: own.renderer} | {
@@ -153,8 +169,6 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
     parts = {name: build_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
     renderer = _MultiRenderer({name: p.renderer for name, p in parts.items()}, own.renderer.name)
     policy = _MultiPolicy({name: p.policy for name, p in parts.items()}, renderer)
-    if not policy.sensors:
-        raise InputError(DOING, past.name, f"the policy {own.policy.name!r} has no camera", "probe a rollout of a policy with cameras")
     with temporary_folder("simrun-probe-") as folder:
         with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
             run_rollout(past.scenario, renderer, policy, own.seed, recorder, parts[own.renderer.name].controller)
@@ -167,11 +181,11 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
             f"its replay differs from the log: {difference}",
             "use the machine and the versions in run.json, or run the rollout again",
         )
-    queries = tuple(policy.queries)
-    return Probe(queries, tuple(_pair(queries, renderers[0], name) for name in renderers[1:]))
+    return tuple(policy.queries)
 
 
-def _pair(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair:
+def compare(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair:
+    """Compare the plans of two renderers over all queries."""
     n, first, first_gap = len(queries), None, None
     gap, turn, levels = np.full((n, len(HORIZONS_S)), np.nan), np.full((n, len(HORIZONS_S)), np.nan), np.zeros(n)
     for row, query in enumerate(queries):

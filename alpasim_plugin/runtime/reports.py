@@ -13,13 +13,15 @@ from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.log import decode_image, encode_image, read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, probe_folder
+from alpasim_plugin.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, WHY_NAME, probe_folder
+from alpasim_plugin.viewer.cause import cause_of_log, write_cause
 from alpasim_plugin.viewer.page import write_flips_page
 from alpasim_plugin.viewer.pictures import smaller
+from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import read_run
 from evaluators.report import write_junit, write_report, write_summary_md
-from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips
+from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips, key_of_entry
 
 
 def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
@@ -35,6 +37,7 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
     if flips and page:
         write_flips(root)
         replays = write_flips_page(root)
+        write_causes(root)
     write_summary_md(root)
     write_junit(root)
     if page:
@@ -42,6 +45,26 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
     for name in PAGES:
         (root / name).unlink(missing_ok=True)
     return None
+
+
+MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any other
+
+
+def write_causes(root: Path) -> None:
+    """Write the page of a cause for the first drives that failed, one a scene and arm; those of `simrun why` are kept.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(root)
+    told = read_json(root / FLIPS_NAME)["cells"]
+    failed = {one.cell[:3]: one for one in reversed(run.rollouts) if one.ok and outcomes_of(one)}
+    for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
+        if run.file_of(rollout, WHY_NAME) is None:
+            own = [entry for entry in told if key_of_entry(entry)[:4] == rollout.cell]
+            cause = cause_of_log(run, rollout, own)
+            if cause is not None:
+                write_cause(run, cause)
 
 
 MAX_FLIPS = 60  # cells whose logs are read

@@ -26,6 +26,7 @@ class WatchedCell:
     """The rollouts of one scene, policy and seed, one for each renderer, which are replayed side by side.
 
     Attributes:
+        policy: The policy; where policies stand side by side, their renderer.
         take: 0, except where several logs of one renderer have the same scene, policy and seed.
         rollouts: In the order of the run's renderers; the failed ones too.
         flips: Changed outcomes among them.
@@ -37,6 +38,11 @@ class WatchedCell:
     take: int
     rollouts: tuple[Rollout, ...]
     flips: tuple[Flip, ...]
+    by_policy: bool = False  # one renderer's rollouts, one for each policy
+
+    def side(self, rollout: Rollout) -> str:
+        """Give what a rollout is called beside the others."""
+        return rollout.policy if self.by_policy else rollout.renderer
 
     @property
     def id(self) -> str:
@@ -70,9 +76,9 @@ class WatchedCell:
         return any(rollout.ok for rollout in self.rollouts)
 
     def outcomes(self) -> dict[str, str]:
-        """Give the outcome of each renderer in words."""
-        failed = {r.renderer: f"failed: {r.failure_class or 'unknown'}" for r in self.rollouts if not has_ended(r)}
-        return {r.renderer: failed.get(r.renderer) or in_words(outcomes_of(r)) for r in self.rollouts}
+        """Give the outcome of each rollout in words, by what it is called."""
+        failed = {self.side(r): f"failed: {r.failure_class or 'unknown'}" for r in self.rollouts if not has_ended(r)}
+        return {self.side(r): failed.get(self.side(r)) or in_words(outcomes_of(r)) for r in self.rollouts}
 
 
 @dataclass(frozen=True)
@@ -108,24 +114,40 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
             raise InputError(DOING, f"{flag} {strange[0]}", found, "name one of these")
 
 
-def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
-    """List the cells of a run that were asked for, the most telling first."""
+def has_policies_alone(run: Run) -> bool:
+    """Tell whether a run compares policies and not renderers."""
+    return len(run.renderers) == 1 and len(run.policies) > 1
+
+
+def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[WatchedCell]:
+    """List the cells of a run that were asked for, the most telling first.
+
+    Args:
+        run: The run.
+        wanted: What was asked for.
+        arms: Where the run has one renderer, its policies stand side by side.
+    """
+    by_policy = arms and has_policies_alone(run)
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     base = baseline_of(run)
-    rank = {name: i for i, name in enumerate(sorted(run.renderers, key=lambda name: name != base))}
+    rank = {name: i for i, name in enumerate(run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base))}
     scene = {name: i for i, name in enumerate(run.scenes)}
-    for rollout in sorted(run.rollouts, key=lambda r: (scene[r.scene], r.policy, r.seed, rank[r.renderer])):
+    for rollout in sorted(
+        run.rollouts, key=lambda r: (scene[r.scene], *((r.seed, rank[r.policy]) if by_policy else (r.policy, r.seed, rank[r.renderer])))
+    ):
         if not _asked(rollout, wanted):
             continue
-        key, take = (rollout.scene, rollout.policy, rollout.seed), 0
-        while any(r.renderer == rollout.renderer for r in grouped.get((*key, take), ())):
+        key, take = (rollout.scene, rollout.renderer if by_policy else rollout.policy, rollout.seed), 0
+        while any((r.renderer, r.policy) == (rollout.renderer, rollout.policy) for r in grouped.get((*key, take), ())):
             take += 1
         grouped.setdefault((*key, take), []).append(rollout)
     flips: dict[tuple[str, str, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
-        if flip.base.policy == flip.other.policy and _asked(flip.other, wanted):  # a cell shows one policy behind all renderers
-            flips.setdefault((flip.other.scene, flip.other.policy, flip.other.seed), []).append(flip)
-    cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ()))) for key, members in grouped.items()]
+        inside = flip.base.renderer == flip.other.renderer if by_policy else flip.base.policy == flip.other.policy
+        if inside and _asked(flip.other, wanted):  # a cell shows one policy behind all renderers, or the other way round
+            fixed = flip.other.renderer if by_policy else flip.other.policy
+            flips.setdefault((flip.other.scene, fixed, flip.other.seed), []).append(flip)
+    cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy) for key, members in grouped.items()]
     return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))  # stable: equal ones stay in the run's order
 
 

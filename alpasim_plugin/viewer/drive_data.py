@@ -169,9 +169,9 @@ def drive_data(
     manifest = run.manifest(rollout)
     ego, size_m = _ego(log, steps, content, place)
     return {
-        "renderer": rollout.renderer,
         "ego": ego,
         "size": [round(100 * side) for side in size_m],
+        "rear": 0 if log is None else round(100 * float(log.T_rig_box[0, 3])),
         "users": _road_users(log, content, place, tracks),
         "as_driven": log is not None,
         "plans": [] if log is None else [_plan(plan, place) for plan in log.plans],
@@ -196,10 +196,8 @@ def _ego(log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], pl
 
 def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks) -> list[int]:
     if log is not None:
-        return [
-            tracks.add(_user(actor.actor_id, actor.label, (actor.box.length_m, actor.box.width_m), place.track(actor.track)))
-            for actor in log.actors.values()
-        ]
+        boxes = {a.actor_id: (a.box.length_m, a.box.width_m, a.box.height_m) for a in log.actors.values()}
+        return [tracks.add(_user(a.actor_id, a.label, boxes[a.actor_id], place.track(a.track))) for a in log.actors.values()]
     found = []
     for actor in content.get("actors") or []:
         if actor.get("x_m") and actor.get("length_m"):
@@ -209,7 +207,7 @@ def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place
     return found
 
 
-def _user(name: str, label: str, size_m: tuple[float, float], way: dict[str, list[int]]) -> dict[str, Any]:
+def _user(name: str, label: str, size_m: tuple[float, ...], way: dict[str, list[int]]) -> dict[str, Any]:
     if len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1:  # it stands: two poses say when it is there
         way = {key: [values[0], values[-1]] for key, values in way.items()}
     return {"id": name, "label": label or "other", "size": [round(100 * side) for side in size_m], **way}
@@ -285,14 +283,21 @@ def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, An
     return found[:MAX_FRAME_EVENTS]
 
 
-def plans_part(flips: Sequence[Mapping[str, Any]], place: Place) -> list[dict[str, Any]]:
-    """Return when plans first diverged, of entries of ``flips.json``."""
+def plans_part(flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool) -> list[dict[str, Any]]:
+    """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in `WatchedCell`."""
+
+    def sides(entry: Mapping[str, Any]) -> tuple[str, str]:
+        """Return what the two are called."""
+        if by_policy:
+            return str(entry["policy"]), str(entry["against"]).removeprefix(f"{entry['renderer']}/")
+        return str(entry["renderer"]), str(entry["baseline"])
+
     return [
         {
             "t": round((int(entry["t_us"]) - place.zero_us) / 1000),
             "kind": "plans",
-            "text": f"plans part by {float(entry['gap_m']):.2f} m from {entry['baseline']}",
-            "renderer": entry["renderer"],
+            "text": f"plans part by {float(entry['gap_m']):.2f} m from {sides(entry)[1]}",
+            "renderer": sides(entry)[0],
         }
         for entry in flips
         if entry.get("t_us") is not None

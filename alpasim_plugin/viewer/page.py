@@ -105,7 +105,7 @@ def names(cells: Iterable[WatchedCell], at_most: int = 12) -> str:
 
 MB = 1_000_000
 DEFAULT_MB = 15.0  # megabytes, not mebibytes
-SCRIPTS = ("theme.js", "timeline.js", "cameras.js", "birdseye.js", "curves.js", "moments.js", "player.js")
+SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cameras.js", "birdseye.js", "curves.js", "moments.js", "player.js")
 STYLES = ("theme.css", "viewer.css")
 
 
@@ -162,18 +162,17 @@ def render(index: str, documents: Mapping[str, str], live: bool = False) -> str:
         documents: Cell id -> JSON of `cell_data`.
         live: The page asks its own server for documents.
     """
+    filled = {name: Markup(text) for name, text in documents.items()}
+    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=filled, live=live)
+
+
+def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
+    """Fill a template of a page that holds its scripts and styles and allows no others."""
     environment = _environment()
-    script = "\n".join(asset(environment, name) for name in SCRIPTS)
-    style = "\n".join(asset(environment, name) for name in STYLES)
-    return environment.get_template("viewer.html.j2").render(
-        style=Markup(style),
-        style_hash=_sha256(style),
-        script=Markup(script),
-        script_hash=_sha256(script),
-        index=Markup(index),
-        documents={name: Markup(text) for name, text in documents.items()},
-        live=live,
-    )
+    script = "\n".join(asset(environment, name) for name in scripts)
+    style = "\n".join(asset(environment, name) for name in styles)
+    own = {"style": Markup(style), "style_hash": _sha256(style), "script": Markup(script), "script_hash": _sha256(script)}
+    return environment.get_template(template).render(**own, **values)
 
 
 @cache
@@ -255,7 +254,7 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
         InfrastructureError: The page cannot be written.
     """
     check_wanted(run, wanted)
-    cells = cells_of(run, wanted)
+    cells = cells_of(run, wanted, arms=True)
     if not any(cell.watchable for cell in cells):
         raise InputError(DOING, str(run.folder), "no finished rollout that was asked for", "ask for others; simrun report lists failures")
     with reporting(run):
@@ -275,16 +274,16 @@ def write_flips_page(root: Path) -> Mapping[FlipKey, str]:
         InputError: The run folder is not complete enough to be read.
     """
     run = read_run(root)
-    flipped = telling(cells_of(run))
+    flipped = telling(cells_of(run, arms=True))
     if not flipped:
         (root / FLIPS_PAGE).unlink(missing_ok=True)
         return {}
     with reporting(run):
         page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
     write_text(root / FLIPS_PAGE, page.html, DOING)
-    return {flip.key: f"{FLIPS_PAGE}#{address(cell, flip.other.renderer)}" for cell in page.cells for flip in cell.flips}
+    return {flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}" for cell in page.cells for flip in cell.flips}
 
 
 def address(cell: WatchedCell, renderer: str) -> str:
-    """Return the part of an address that opens a cell with one renderer followed."""
+    """Return the part of an address that opens a cell with one of its drives followed."""
     return urlencode({"scene": cell.scene, "policy": cell.policy, "seed": cell.seed, "renderer": renderer})

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError, SimrunError
-from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import LOG_NAME
+from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
@@ -64,16 +64,21 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
     drives: list[dict[str, Any]] = []
     for rollout in cell.rollouts:
         if not rollout.ok:
-            drives.append({"renderer": rollout.renderer, "failed": f"{rollout.failure_class}: {rollout.failure}"})
+            drives.append({"renderer": cell.side(rollout), "failed": f"{rollout.failure_class}: {rollout.failure}"})
             continue
         log = logs[rollout.path]
         if isinstance(log, SimrunError):
-            drives.append({"renderer": rollout.renderer, "failed": f"its log cannot be read: {log.found}"})
+            drives.append({"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.found}"})
             continue
-        drive = drive_data(run, rollout, log, content, place, tracks)
+        drive = {"renderer": cell.side(rollout)} | drive_data(run, rollout, log, content, place, tracks)
+        drive |= {"why": run.href(rollout, WHY_NAME) or ""}
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
             drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
+            known = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
+            for one in drive["cameras"]:
+                if one["name"] in known:
+                    one["lens"] = lens_data(known[one["name"]], one["width"])
             drive["no_frames"] = "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
         drives.append(drive)
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
@@ -82,10 +87,19 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
         "map": map_data(content, recorded, place),
         "users": tracks.all,
         "drives": drives,
-        "parts": plans_part(_flip_entries(run, cell), place),
+        "parts": plans_part(_flip_entries(run, cell), place, cell.by_policy),
         "end": max([*ends, 1]),
         "warmup": round(int(content.get("warmup_us") or 0) / 1000),
+        "origin": place.origin.tolist(),
+        "zero_us": place.zero_us,
     }
+
+
+def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
+    """Return what projects rig coordinates into a picture of at most this width: fx, fy, cx, cy, and the mounting, 3 rows of 4."""
+    scale = min(1.0, width_px / camera.width)
+    k = [round(float(camera.K[at]) * scale, 3) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
 
 
 def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
@@ -112,7 +126,7 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address, or "") and, of a run that goes on,
             ``done`` and ``planned``.
     """
-    ids = {cell.id for cell in here}
+    ids, by_policy = {cell.id for cell in here}, any(cell.by_policy for cell in cells)
     units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}
     metrics = {}
     for name in run.table.ordered({*run.table, *units}):
@@ -120,8 +134,8 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         metrics[name] = {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
     return {
         "run": run.folder.resolve().name,
-        "renderers": run.renderers,
-        "baseline": baseline_of(run),
+        "renderers": run.policies if by_policy else run.renderers,
+        "baseline": next((cell.side(flip.base) for cell in cells for flip in cell.flips), baseline_of(run)),
         "first_curves": run.table.first_curves(),
         "metrics": metrics,
         "cells": [
@@ -133,7 +147,7 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
                 "take": cell.take,
                 "interest": cell.interest,
                 "outcomes": cell.outcomes(),
-                "flips": [{"renderer": flip.other.renderer, "was": flip.was, "now": flip.now, "tone": flip.tone} for flip in cell.flips],
+                "flips": [{"renderer": cell.side(flip.other), "was": flip.was, "now": flip.now, "tone": flip.tone} for flip in cell.flips],
                 "here": cell.id in ids,
             }
             for cell in cells

@@ -84,13 +84,17 @@ def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
         picture = smaller(rgb, fine.width_px)
         size = (picture.shape[1], picture.shape[0])
         t_ms.append(round((t_us - zero_us) / 1000))
-        # Halved colour resolution and optimised tables: a page is looked at, not measured.
-        settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-        done, jpeg = cv2.imencode(".jpg", picture[..., ::-1], settings)
-        if not done:
-            raise InputError("encoding a camera frame", f"array {picture.shape}", "the encoder refused", "use smaller images")
-        data.append(base64.b64encode(jpeg.tobytes()).decode())
+        data.append(jpeg(picture))
     return {"name": source.camera, "width": size[0], "height": size[1], "t": t_ms, "jpeg": data}
+
+
+def jpeg(rgb: U8) -> str:
+    """Encode a picture ``(H, W, 3)`` for a page, as base64."""
+    # Halved colour resolution and optimised tables: a page is looked at, not measured.
+    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+    if not done:
+        raise InputError("encoding a camera frame", f"array {rgb.shape}", "the encoder refused", "use smaller images")
+    return base64.b64encode(data.tobytes()).decode()
 
 
 def smaller(rgb: U8, width_px: int) -> U8:

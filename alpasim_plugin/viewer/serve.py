@@ -138,7 +138,7 @@ class RunServer(ThreadingHTTPServer):
 
     def cells(self) -> list[WatchedCell]:
         """List the cells of which anything is there."""
-        return cells_of(self.run, self._wanted)
+        return cells_of(self.run, self._wanted, arms=True)
 
     def index(self) -> dict[str, Any]:
         """Return what the page shows of the run."""

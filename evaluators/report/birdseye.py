@@ -47,6 +47,7 @@ class Mark:
     x: int | None
     y: int | None
     footprint: str = ""
+    folder: str = ""  # of the rollout
 
 
 @dataclass(frozen=True)
@@ -277,7 +278,7 @@ def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: V
     variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
     when = f"at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s" if event.t_us is not None else "at a time that no step shows"
     if event.x_m is None or event.y_m is None:
-        return Mark(variant, event.kind, f"{label}: {event.what} {when}", None, None)
+        return Mark(variant, event.kind, f"{label}: {event.what} {when}", None, None, folder=event.rollout.path)
     yaw = event.yaw_rad or 0.0
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     ahead = float(vehicle.get("rear_axle_to_centre_m") or 0.0) if event.yaw_rad is not None else 0.0
@@ -288,7 +289,7 @@ def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: V
         box = corners(centre[0], event.yaw_rad, vehicle["length_m"], vehicle["width_m"])
         footprint = path_data(frame.units(box), closed=True, tolerance=0.0)
     where = f"x {fixed(centre[0, 0], 1)}, y {fixed(centre[0, 1], 1)}\u00a0m"
-    return Mark(variant, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint)
+    return Mark(variant, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint, event.rollout.path)
 
 
 def _offset_chart(rollouts: Sequence[Rollout], series: Series, variant_of: Variants, label: Any) -> OffsetChart | None:

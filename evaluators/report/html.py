@@ -17,7 +17,7 @@ from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Series
-from alpasim_plugin.run_folder.schema import AGAIN, DOING
+from alpasim_plugin.run_folder.schema import AGAIN, DOING, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
@@ -120,6 +120,7 @@ def context(run: Run) -> dict[str, Any]:
         "variant_colour": colours,
         "forest": forest(run, colours),
         "flips": flips,
+        "whys": {one.path: page for one in run.rollouts if one.ok and outcomes_of(one) and (page := run.href(one, WHY_NAME))},
         "more_flips": more_flips,
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.run_folder.rows import Own, Rollout, Series, series_by_cell
+from alpasim_plugin.run_folder.schema import WHY_NAME
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, has_ended, in_words, outcomes_of, told
 from evaluators.opening import Run
 
@@ -119,7 +120,7 @@ def _at(own: Own, name: str, t_us: int) -> float | None:
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a failure's message
 KEPT_BITS = 13  # of a number's mantissa
-COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP = (1 << bit for bit in range(5))
+COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(6))
 CLIP = "front.mp4"
 
 
@@ -213,5 +214,6 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
                     names[parent] = frozenset(one.name for one in found if one.is_dir(follow_symlinks=False))
         if leaf in names[parent]:
             state |= HAS_FOLDER | (HAS_CLIP if has_clips and (run.folder / parent / leaf / CLIP).is_file() else 0)
+            state |= HAS_WHY if state & (COLLIDED | OTHERWISE) and (run.folder / parent / leaf / WHY_NAME).is_file() else 0
         states.append(state)
     return np.array(states, dtype=np.uint8)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import WHY_NAME
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
@@ -338,7 +339,13 @@ def _chip(run: Run, rollout: Rollout) -> Chip:
     facts = [f"seed {rollout.seed}: {said}"]
     facts += [f"{rollout.frames} frames"] if rollout.frames is not None else []
     facts += [duration(rollout.wall_s)] if rollout.wall_s is not None else []
-    return Chip(f"{rollout.seed}{letter}", state, ", ".join(facts), run.href(rollout), run.href(rollout, "front.mp4"))
+    return Chip(
+        f"{rollout.seed}{letter}",
+        state,
+        ", ".join(facts),
+        (run.href(rollout, WHY_NAME) if had else None) or run.href(rollout),
+        run.href(rollout, "front.mp4"),
+    )
 
 
 def _state(outcome: str) -> str:

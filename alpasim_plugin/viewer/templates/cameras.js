@@ -5,8 +5,10 @@ const AHEAD = 10; // frames decoded before they are due
 const KEPT = 48; // decoded frames kept a camera
 
 class Camera {
-  constructor(canvas, frames) {
+  // over(context, t): draws over the frame of time t.
+  constructor(canvas, frames, over) {
     this.canvas = canvas;
+    this.over = over;
     this.frames = frames;
     this.decoded = new Map(); // index -> ImageBitmap, or a promise of one
     this.wanted = -1;
@@ -20,13 +22,15 @@ class Camera {
   async show(t) {
     const i = lastAt(this.frames.t, t);
     this.canvas.dataset.wanted = String(i < 0 ? "" : this.frames.t[i]);
-    if (i === this.wanted) return;
+    if (i === this.wanted && !this.stale) return;
     this.wanted = i;
+    this.stale = false;
     if (i < 0) { this.clear(); return; }
     for (let k = i; k < Math.min(i + AHEAD, this.frames.t.length); k += 1) this.decode(k);
     const picture = await this.decode(i);
     if (this.wanted !== i) return; // a newer frame is due by now
     this.context.drawImage(picture, 0, 0);
+    this.over(this.context, this.frames.t[i]);
     this.shown = i;
     this.canvas.dataset.shown = String(this.frames.t[i]);
     this.forget(i);
@@ -62,23 +66,39 @@ class Camera {
 // The row of cameras: one figure for each renderer of the cell.
 class Cameras {
   constructor(root, index, onFocus, onToggle) {
-    Object.assign(this, { root, index, onFocus, onToggle, shown: [] });
+    Object.assign(this, { root, index, onFocus, onToggle, shown: [], layers: new Set(["plan"]) });
+  }
+
+  setLayers(names) {
+    this.layers = new Set(names);
+    for (const one of this.shown) if (one.camera) one.camera.stale = true;
+  }
+
+  // Draw what belongs over a frame of time t: the plan in force, and on request the map and the road users.
+  over(cell, drive, i, lens, context, t) {
+    if (!lens || !this.layers.size) return;
+    const overlay = new Overlay(context, lens, drive.rear), colour = getComputedStyle(document.documentElement).getPropertyValue(`--${variantClass(this.index, drive.renderer)}`).trim();
+    overlay.at(heldPose(drive.ego, t));
+    overlay.scene(cell, drive.users, t, this.layers);
+    drive.planTimes ??= drive.plans.map((plan) => plan.t);
+    const k = lastAt(drive.planTimes, t);
+    if (k >= 0) overlay.plan(drive.plans[k].lines, colour, this.layers.has("samples"));
   }
 
   load(cell, outcomes, cameraName) {
     this.shown.forEach((one) => one.camera?.close());
     this.root.replaceChildren();
-    this.shown = cell.drives.map((drive, i) => this.figure(drive, i, outcomes[drive.renderer] ?? "", cameraName));
+    this.shown = cell.drives.map((drive, i) => this.figure(drive, i, outcomes[drive.renderer] ?? "", cameraName, cell));
     this.root.dataset.count = String(cell.drives.length);
     this.root.classList.toggle("bare", this.shown.every((one) => !one.camera)); // words alone need no room for pictures
   }
 
-  figure(drive, i, outcome, cameraName) {
+  figure(drive, i, outcome, cameraName, cell) {
     const figure = make("figure", "camera " + variantClass(this.index, drive.renderer));
     const head = make("figcaption");
     const focus = make("button", "focus");
     focus.type = "button";
-    focus.title = drive.renderer + ": follow this renderer's ego, and show its samples and road users" + (i < 9 ? " (" + (i + 1) + ")" : "");
+    focus.title = drive.renderer + ": follow this drive, and show its samples and road users" + (i < 9 ? " (" + (i + 1) + ")" : "");
     focus.append(make("span", "swatch"), make("b", "name", drive.renderer));
     focus.addEventListener("click", () => this.onFocus(i));
     const said = make("span", "outcome" + (outcome === "no event" ? "" : " bad"), outcome);
@@ -98,7 +118,7 @@ class Cameras {
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", "Camera " + frames.name + " behind " + drive.renderer);
       stage.append(canvas);
-      camera = new Camera(canvas, frames);
+      camera = new Camera(canvas, frames, (context, t) => this.over(cell, drive, i, frames.lens, context, t));
     } else {
       const why = drive.failed ? "Nothing to show. " + drive.failed : drive.no_frames || "No camera frames.";
       stage.append(make("p", "none", why));

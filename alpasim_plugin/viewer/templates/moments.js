@@ -9,7 +9,7 @@ class Moments {
   }
 
   load(cell, from, to) {
-    const own = cell.drives.flatMap((drive, i) => (drive.moments ?? []).map((one) => ({ ...one, i, renderer: drive.renderer })));
+    const own = cell.drives.flatMap((drive, i) => (drive.moments ?? []).map((one) => ({ ...one, i, renderer: drive.renderer, why: one.kind === "frame" ? "" : drive.why })));
     const parts = cell.parts.map((one) => ({ ...one, i: cell.drives.findIndex((drive) => drive.renderer === one.renderer) }));
     this.all = [...own, ...parts].filter((one) => one.t !== null).sort((a, b) => a.t - b.t);
     const untimed = own.filter((one) => one.t === null);
@@ -31,6 +31,7 @@ class Moments {
     button.append(said);
     button.addEventListener("click", () => this.onJump(moment));
     item.append(button);
+    if (moment.why && this.index.report) item.append(Object.assign(make("a", "why-link small", "why"), { href: this.index.report.replace(/report\.html$/, "") + moment.why }));
     moment.button = button;
     return item;
   }
@@ -69,7 +70,7 @@ class Moments {
       item.append(button);
       return item;
     }));
-    const none = this.index.renderers.length > 1 ? "None: every pair of rollouts ends alike." : "Nothing to compare: the run has one renderer.";
+    const none = this.index.renderers.length > 1 ? "None: every pair of rollouts ends alike." : "Nothing to compare: the run has one renderer and one policy.";
     if (!rows.length) this.flips.append(make("li", "small muted none", none));
   }
 

@@ -3,6 +3,7 @@
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 const POLL_MS = 2000;
+const LAYERS = [["plan", ["plan"]], ["plan and map", ["plan", "samples", "lanes", "recorded", "users"]], ["nothing", []]];
 
 const player = {
   index: JSON.parse(byId("index").textContent),
@@ -78,7 +79,8 @@ const player = {
     const changed = renderer ?? entry.flips[0]?.renderer ?? driven[0]?.renderer;
     const focus = cell.drives.findIndex((drive) => drive.renderer === changed && drive.ego);
     const times = driven.flatMap((drive) => [drive.ego.t[0], ...(drive.cameras ?? []).slice(0, 1).map((one) => one.t[0])]);
-    Object.assign(this, { cell, from: Math.min(0, ...times), to: cell.end, hidden: new Set(), focus: Math.max(0, focus) });
+    const pictured = driven.some((drive) => drive.cameras?.length); // before the first frame there is nothing to see
+    Object.assign(this, { cell, from: pictured ? Math.min(...driven.flatMap((drive) => (drive.cameras ?? []).map((one) => one.t[0]))) : Math.min(0, ...times), to: cell.end, hidden: new Set(), focus: Math.max(0, focus) });
     this.step = Math.max(10, Math.round((driven[0]?.ego.t.at(-1) - driven[0]?.ego.t.at(-2)) || 100));
     document.title = `${entry.scene} – ${index.run} – simrun view`;
     this.birdseye.load(cell);
@@ -204,6 +206,15 @@ const player = {
     if (this.cell) this.birdseye.draw(this.t, this.focus, this.hidden);
   },
 
+  // What is drawn over the pictures: the plan, all that is known, nothing.
+  nextLayers() {
+    this.layers = (LAYERS.findIndex(([name]) => name === byId("over").dataset.name) + 1) % LAYERS.length;
+    const [name, layers] = LAYERS[this.layers];
+    Object.assign(byId("over"), { textContent: `Over the picture: ${name}` }).dataset.name = name;
+    this.cameras.setLayers(layers);
+    if (this.cell) this.show();
+  },
+
   say(text) { byId("said").textContent = text; },
 
   // The address names what is shown, so that it can be sent to somebody.
@@ -262,6 +273,7 @@ const player = {
     click("whole", () => this.birdseye.setFollow(false));
     click("nearer", () => this.birdseye.zoomBy(1.4));
     click("farther", () => this.birdseye.zoomBy(1 / 1.4));
+    click("over", () => this.nextLayers());
     click("help", () => byId("keys").showModal());
     click("close-help", () => byId("keys").close());
     byId("scrub").addEventListener("input", (event) => { this.play(false); this.seek(Number(event.target.value)); });
@@ -298,6 +310,7 @@ const player = {
       "[": () => this.neighbour(-1), "]": () => this.neighbour(1),
       ",": () => this.setSpeed(SPEEDS[Math.max(0, speed - 1)]), ".": () => this.setSpeed(SPEEDS[Math.min(SPEEDS.length - 1, speed + 1)]),
       "+": () => this.birdseye.zoomBy(1.4), "-": () => this.birdseye.zoomBy(1 / 1.4),
+      o: () => this.nextLayers(),
       f: () => this.birdseye.setFollow(!this.birdseye.follow),
       "?": () => byId("keys").showModal(),
     };

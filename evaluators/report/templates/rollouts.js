@@ -3,7 +3,7 @@
   const holder = document.getElementById("rollouts-data");
   if (!holder) return;
   const ROW = 34, SPARE = 8; // height of a row in pixels, as in the style sheet; rows drawn beyond the edges
-  const COLLIDED = 1, OTHERWISE = 2, FAILED = 4, HAS_FOLDER = 8, HAS_CLIP = 16;
+  const COLLIDED = 1, OTHERWISE = 2, FAILED = 4, HAS_FOLDER = 8, HAS_CLIP = 16, HAS_WHY = 32;
   const at = (id) => document.getElementById(id);
   const box = at("rollouts-box"), table = at("table-rollouts"), head = table.tHead.rows[0], body = table.tBodies[0], picked = at("rollouts-picked");
   const make = (tag, text, more = {}) => Object.assign(document.createElement(tag), text === undefined ? {} : { textContent: text }, more);
@@ -143,6 +143,7 @@
       opened = row;
       const links = make("p", undefined, { className: "small" });
       const folder = `${text("folder", row)}/${text("leaf", row)}`;
+      if (state[row] & HAS_WHY) links.append(make("a", "why", { href: `${folder}/why.html` }), " ");
       if (state[row] & HAS_FOLDER) links.append(make("a", "rollout folder", { href: `${folder}/` }), " ");
       if (state[row] & HAS_CLIP) links.append(make("a", "clip", { href: `${folder}/front.mp4` }), " ");
       if (!(state[row] & HAS_FOLDER)) links.append("No folder of this rollout is beside this page. ");

@@ -1,0 +1,100 @@
+"use strict";
+// Lines on the road and boxes of road users, projected into a camera picture. The ground is the plane on which the ego stands.
+
+const NEAR_M = 0.4, REACH_CM = 9000;
+
+class Overlay {
+  // lens: {k: [fx, fy, cx, cy] in pixels of the picture, T: rig from camera, 3 rows of 4}; rear: from the rear axle to the box centre, cm.
+  constructor(context, lens, rear) {
+    Object.assign(this, { context, lens, rear });
+  }
+
+  at({ x, y, a }) { // the pose of the ego's box centre
+    const c = Math.cos(a / 1000), s = Math.sin(a / 1000);
+    Object.assign(this, { c, s, x: x - this.rear * c, y: y - this.rear * s });
+  }
+
+  // World centimetres and height in metres -> metres before the camera: right, down, forward.
+  camera(x, y, z = 0) {
+    const dx = (x - this.x) / 100, dy = (y - this.y) / 100, { T } = this.lens;
+    const p = [this.c * dx + this.s * dy - T[3], this.c * dy - this.s * dx - T[7], z - T[11]];
+    return [0, 1, 2].map((k) => T[k] * p[0] + T[4 + k] * p[1] + T[8 + k] * p[2]);
+  }
+
+  pixel([x, y, z]) { const [fx, fy, cx, cy] = this.lens.k; return [(fx * x) / z + cx, (fy * y) / z + cy]; }
+
+  // Add a segment to the path, cut where it passes behind the camera.
+  segment(p, q) {
+    if (p[2] < NEAR_M && q[2] < NEAR_M) return;
+    const cut = (one, other) => {
+      if (one[2] >= NEAR_M) return one;
+      const f = (NEAR_M - one[2]) / (other[2] - one[2]);
+      return one.map((v, k) => v + f * (other[k] - v));
+    };
+    this.context.moveTo(...this.pixel(cut(p, q)));
+    this.context.lineTo(...this.pixel(cut(q, p)));
+  }
+
+  line([xs, ys], close = false) {
+    const near = (i) => Math.abs(xs[i] - this.x) < REACH_CM && Math.abs(ys[i] - this.y) < REACH_CM;
+    for (let i = close ? 0 : 1; i < xs.length; i += 1) {
+      const j = i ? i - 1 : xs.length - 1;
+      if (near(i) || near(j)) this.segment(this.camera(xs[j], ys[j]), this.camera(xs[i], ys[i]));
+    }
+  }
+
+  lines(all, { colour, width = 1.5, dash = [], alpha = 1, close = false }) {
+    const { context } = this;
+    context.beginPath();
+    for (const one of all) this.line(one, close);
+    Object.assign(context, { strokeStyle: colour, lineWidth: width, globalAlpha: alpha, lineJoin: "round", lineCap: "round" });
+    context.setLineDash(dash);
+    context.stroke();
+    context.setLineDash([]);
+    context.globalAlpha = 1;
+  }
+
+  // A plan: a line with a dot for every second; its points are half a second apart.
+  plan([line, ...samples], colour, withSamples) {
+    if (withSamples && samples.length) this.lines(samples, { colour, width: 1, alpha: 0.55 });
+    this.lines([line], { colour: "#fff", width: 5, alpha: 0.8 });
+    this.lines([line], { colour, width: 3 });
+    const { context } = this;
+    context.fillStyle = colour;
+    for (let k = 2; k < line[0].length; k += 2) {
+      const p = this.camera(line[0][k], line[1][k]);
+      if (p[2] < NEAR_M) continue;
+      context.beginPath();
+      context.arc(...this.pixel(p), 4, 0, 7);
+      context.fill();
+    }
+  }
+
+  box(user, pose, colour) {
+    const [half, wide] = [user.size[0] / 2, user.size[1] / 2], high = (user.size[2] ?? 160) / 100, c = Math.cos(pose.a / 1000), s = Math.sin(pose.a / 1000);
+    const corner = (u, v, z) => this.camera(pose.x + c * u - s * v, pose.y + s * u + c * v, z);
+    const ring = [[-half, -wide], [half, -wide], [half, wide], [-half, wide]];
+    if (Math.hypot(pose.x - this.x, pose.y - this.y) > REACH_CM) return;
+    this.context.beginPath();
+    ring.forEach(([u, v], i) => {
+      const [a, b] = ring[(i + 1) % 4];
+      for (const z of [0, high]) this.segment(corner(u, v, z), corner(a, b, z));
+      this.segment(corner(u, v, 0), corner(u, v, high));
+    });
+    Object.assign(this.context, { strokeStyle: colour, lineWidth: 1.5 });
+    this.context.stroke();
+  }
+
+  // What a map and road users give: `wanted` names the layers.
+  scene(cell, users, t, wanted) {
+    if (wanted.has("lanes")) {
+      this.lines(cell.map.paint, { colour: "#ffe14d", width: 1.2, alpha: 0.9 });
+      this.lines(cell.map.edges, { colour: "#ff7ad9", width: 1.4, alpha: 0.9 });
+    }
+    if (wanted.has("recorded")) this.lines([cell.map.log], { colour: "#fff", width: 2, dash: [7, 6] });
+    if (wanted.has("users")) for (const i of users) {
+      const pose = poseAt(cell.users[i], t, 60);
+      if (pose) this.box(cell.users[i], pose, "#5cf2ff");
+    }
+  }
+}
