@@ -133,7 +133,7 @@ def _moving(files: Sequence[Path], films: bool, tell: Report) -> tuple[list[_Sho
                 chosen, every = chosen[::2], 2 * every
     if len(chosen) > MOST:
         chosen, every = chosen[::2], 2 * every
-    left_out = {"black": black, "in which the world hardly moves": standing}
+    left_out = {"that are black": black, "in which the world hardly moves": standing}
     notes = [f"{count} pictures {which} were left out" for which, count in left_out.items() if count]
     return chosen, notes + [f"every {every}. picture of {moving} is used"] * (every > 1)
 

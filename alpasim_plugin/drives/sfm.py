@@ -1,7 +1,7 @@
 """Photographs without poses, and videos: structure from motion by COLMAP (extra ``sfm``), with settings for a car that drives straight on.
 
 COLMAP's defaults look for a first pair of photographs with much sideways motion, which such a car never makes: forward motion is allowed,
-angles and numbers of inliers are lowered. Which lens it was is tried: a wide one bends lines so much that a plain one finds no way.
+angles and numbers of inliers are lowered. Which lens it was is told by matches of photographs far apart: a wide one bends lines.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from alpasim_plugin.io.reading import read_json
 PLAIN = "SIMPLE_RADIAL"
 LENSES = {PLAIN: 0.8, "SIMPLE_RADIAL_FISHEYE": 0.5}  # tried, and their focal length at first, in widths: 64 and 115 degrees across
 FEATURES, OVERLAP = 2500, 5  # of a photograph; the next ones that it is matched with, and then the 8th, 16th, ...
+FAR, CLEARLY = 8, 1.05  # photographs between two by which lenses are told apart; by how much a wide one must explain more
+TURNS_RAD = np.radians(3.0)  # of a camera's axis from its mean, by which photographs tell the focal length
 LEAST_SHARE = 0.5  # of the photographs that must be registered
 FRAMES, MODEL, TIMES, DATABASE = "images", "sparse/0", "times.json", "database.db"
 
@@ -60,17 +62,18 @@ def read_unposed(path: Path, work: Path, tell: Report) -> SourceDrive:
         raise InputError(DOING, str(path), found, do)
     pictures = tuple(replace(one, t_us=times[one.file.name]) for one in drive.pictures)
     lens = known[0].lens
-    across = 2 * np.degrees(np.arctan(0.5 * lens.width / lens.K[0, 0]))
+    half = 0.5 * lens.width / lens.K[0, 0]
+    across = 2 * np.degrees(half if lens.model == "fisheye" else np.arctan(half))
     notes += [
         f"poses and lens found by structure from motion: {len(known)} of {len(times)} photographs, {len(drive.points or ())} points",
-        f"the lens was found to see {across:.0f} degrees across; driving straight on leaves that, and lengths along the way, nearly "
-        "free: poses of a calibrated camera know it",
+        f"the lens sees {across:.0f} degrees across: found where the camera turns, else assumed, as driving straight on leaves that and "
+        "lengths along the way free; poses of a calibrated camera know it",
     ]
     return replace(drive, scene_id=path.stem, pictures=pictures, notes=tuple(notes))
 
 
 def _register(path: Path, work: Path, middle: tuple[float, float], tell: Report) -> None:
-    """Run COLMAP's features, sequential matching and incremental mapping for one lens after another; the best model is kept."""
+    """Run COLMAP's features, sequential matching and incremental mapping; the largest model is kept."""
     try:
         import pycolmap
     except ImportError as error:
@@ -87,32 +90,32 @@ def _register(path: Path, work: Path, middle: tuple[float, float], tell: Report)
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, skip_geometric_verification=True)
     pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
-    models: list[Any] = []
-    for number, lens in enumerate(LENSES):
-        tell("registering photographs", number, len(LENSES))
-        models += _mapped(work, lens, middle, threads)
+    tell("registering photographs", 0, 1)
+    models = _mapped(work, middle, threads)
     if not models:
         found = "no two photographs from which a model can begin"
         raise InputError(DOING, str(path), found, "give a part in which the car moves and the world stands, in daylight, or poses")
     target = work / "sparse" / "unfinished"
     target.mkdir(parents=True, exist_ok=True)
-    max(models, key=lambda model: model.compute_num_observations()).write_binary(target)
+    best = max(models, key=lambda model: model.compute_num_observations())
+    _settle(best)
+    best.write_binary(target)
     target.rename(work / MODEL)
 
 
-def _mapped(work: Path, lens: str, middle: tuple[float, float], threads: int) -> list[Any]:
-    """Return the models that COLMAP finds with a lens."""
+def _mapped(work: Path, middle: tuple[float, float], threads: int) -> list[Any]:
+    """Return the models that COLMAP finds."""
     import pycolmap
 
     with pycolmap.Database.open(work / DATABASE) as database:
         camera = database.read_all_cameras()[0]
-        if not (camera.has_prior_focal_length and lens == PLAIN):  # a photograph's file may say it
-            focal = LENSES[lens] * camera.width
-            known = lens != PLAIN  # COLMAP finds no focal length of a lens that bends lines: the guess must do until it is refined
-            changed = pycolmap.Camera(model=lens, width=camera.width, height=camera.height, params=[focal, *middle, 0.0])
-            changed.camera_id, changed.has_prior_focal_length = camera.camera_id, known
-            database.update_camera(changed)
-        database.clear_two_view_geometries()
+        if not camera.has_prior_focal_length:  # which a photograph's file may say
+            fits = {name: _fits(database, lens) for name, lens in _lenses(camera, middle).items()}
+            best = max(fits, key=lambda name: fits[name])
+            chosen = _lenses(camera, middle)[best if fits[best] > CLEARLY * fits[PLAIN] else PLAIN]
+            chosen.has_prior_focal_length = chosen.model.name != PLAIN  # COLMAP asks for it of a lens that bends lines
+            chosen.camera_id = camera.camera_id
+            database.update_camera(chosen)
     pycolmap.geometric_verification(work / DATABASE, pycolmap.GeometricVerifierOptions(num_threads=threads))
     options = pycolmap.IncrementalPipelineOptions(min_model_size=FEWEST, num_threads=threads, max_num_models=4)
     mapper = options.mapper
@@ -122,6 +125,55 @@ def _mapped(work: Path, lens: str, middle: tuple[float, float], threads: int) ->
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3  # all together less often: a short film needs no more
     shutil.rmtree(work / "models", ignore_errors=True)
     return list(pycolmap.incremental_mapping(work / DATABASE, work / FRAMES, work / "models", options).values())
+
+
+def _lenses(camera: Any, middle: tuple[float, float]) -> dict[str, Any]:
+    import pycolmap
+
+    width, height = camera.width, camera.height
+    return {
+        name: pycolmap.Camera(model=name, width=width, height=height, params=[focal * width, *middle, 0.0])
+        for name, focal in LENSES.items()
+    }
+
+
+def _fits(database: Any, lens: Any) -> int:
+    """Return how many matches of photographs far apart meet their epipolar lines with a lens."""
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = 1.0, 0
+    names = sorted((image.name, image.image_id) for image in database.read_all_images())
+    at = {number: database.read_keypoints(number)[:, :2].astype(np.float64) for _, number in names}
+    count = 0
+    for (_, one), (_, other) in zip(names[: -FAR : FAR // 4], names[FAR :: FAR // 4], strict=False):
+        if database.exists_matches(one, other):
+            found = database.read_matches(one, other)
+            count += len(pycolmap.estimate_calibrated_two_view_geometry(lens, at[one], lens, at[other], found, options).inlier_matches)
+    return count
+
+
+def _settle(model: Any) -> None:
+    """Give a camera that never turned the usual lens: a longer one and a way stretched along its axis fit such photographs alike."""
+    import pycolmap
+
+    axes = np.array([image.cam_from_world().inverse().rotation.matrix()[:, 2] for image in model.images.values() if image.has_pose])
+    axis = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
+    (camera,) = model.cameras.values()
+    usual = LENSES[camera.model.name] * camera.width
+    told = camera.model.name == PLAIN and camera.has_prior_focal_length  # by the photographs' files
+    if told or np.arccos(np.clip(axes @ axis, -1, 1)).max() > TURNS_RAD:
+        return
+    longer = usual / camera.params[0]
+    stretch = np.eye(3) + (longer - 1) * np.outer(axis, axis)
+    for point in model.points3D.values():
+        point.xyz = stretch @ point.xyz
+    for frame in model.frames.values():
+        pose = frame.rig_from_world.inverse()
+        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, stretch @ pose.translation).inverse()
+    camera.params = [usual, *camera.params[1:3], camera.params[3] * longer**2]
+    options = pycolmap.BundleAdjustmentOptions(refine_focal_length=False, print_summary=False)
+    pycolmap.bundle_adjustment(model, options)
 
 
 def forget(work: Path) -> None:
