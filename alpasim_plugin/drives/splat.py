@@ -33,11 +33,14 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.builder import placed_cloud
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.world.ground import height_at
 
 DOING = "importing a trained model"
 OPAQUE, MOST_POINTS = 0.3, 100_000  # Gaussians that count as surface; how many of them the ground is looked for in
 SPREAD = 0.5  # of a Gaussian's middle around the surface, in its own mean size
 LEAST_CARRIED, NEAR_M, FEWEST = 0.5, 2.5, 5  # share of the way that must have so many points so near below it
+
+BESIDE_M, CLEARLY_M = 15.0, 0.5  # of the way, where things stand on the ground; above it
 
 
 def import_splat(file: Path, poses: Path, out: Path, report: Report | None = None) -> dict[str, Any]:
@@ -91,6 +94,10 @@ def _built(
     if share < LEAST_CARRIED:
         found = f"{100 * share:.0f} % of the way of the poses runs over Gaussians of the model"
         raise InputError(DOING, str(file), found, "give the poses in the model's own frame and unit: those that it was trained with")
+    above, below = _stands(placed)
+    if below > above:
+        found = f"upside down: beside the way {below} of its surfaces lie below the road and {above} stand on it"
+        raise InputError(DOING, str(file), found, "turn the model over, or give the poses that it was trained with")
     model = Reconstruction(background, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
     begin(work, key)
     shown = shown_photographs(drive, placed) if has_photographs else []
@@ -107,6 +114,14 @@ def _carried(placed: PlacedDrive) -> float:
     tree = scipy.spatial.KDTree(placed.points.xyz)
     near = tree.query_ball_point(placed.ego.xyz, NEAR_M, return_length=True)
     return float(np.mean(np.asarray(near) >= FEWEST))
+
+
+def _stands(placed: PlacedDrive) -> tuple[int, int]:
+    """Return how many points near the way lie clearly above the ground, and below it."""
+    xyz = placed.points.xyz
+    away, _ = scipy.spatial.KDTree(placed.ego.xyz[:, :2]).query(xyz[:, :2])
+    height = (xyz[:, 2] - height_at(placed.ground, xyz))[away < BESIDE_M]
+    return int((height > CLEARLY_M).sum()), int((height < -CLEARLY_M).sum())
 
 
 def _said(has_photographs: bool) -> str:

@@ -105,6 +105,15 @@ def test_poses_of_another_frame_are_refused_and_nothing_is_left(tmp_path: Path) 
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
+def test_a_model_that_hangs_below_its_road_is_refused(tmp_path: Path) -> None:
+    cloud = street_cloud()
+    flipped = GaussianCloud(cloud.means * [1, 1, -1], cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    write_ply(tmp_path / "street.ply", flipped)
+    with pytest.raises(InputError, match="upside down"):
+        import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_thirty_million_gaussians_are_refused_by_their_header(tmp_path: Path) -> None:
     write_ply(tmp_path / "street.ply", street_cloud())
     data = (tmp_path / "street.ply").read_bytes().replace(b"element vertex 18000", b"element vertex 30000000", 1)
