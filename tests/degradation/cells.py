@@ -34,7 +34,8 @@ VERBS: dict[str, tuple[str, ...]] = {
     "new": ("new", "policy", "mine", "--folder", "@new"),
     "check-policy": ("check-policy", "constant-velocity"),
 }
-QUICK = ("list", "compare", "gate", "report", "run")
+KERNELS = "home/.cache/simrun/numba"
+PATIENCE_S = 580
 
 
 @dataclass(frozen=True)
@@ -130,9 +131,13 @@ def outcome(machine: Machine, verb: str, made: Path, work: Path) -> Outcome:
     script = f"import sys; sys.path.insert(0, {str(REPO)!r}); from alpasim_plugin.cli.main import main; main()"
     variables = {key: value.format(work=work) for key, value in machine.variables.items()}
     before = _content(work / "runs")
-    done = run_as_nobody(
-        [sys.executable, "-P", "-c", script, *arguments], cwd=work, mounts=machine.mounts.format(work=work), timeout=580, **variables
-    )
+    command = [sys.executable, "-P", "-c", script, *arguments]
+    try:
+        done = run_as_nobody(command, cwd=work, mounts=machine.mounts.format(work=work), timeout=PATIENCE_S, **variables)
+    except subprocess.TimeoutExpired:
+        return Outcome(-1, f"no end within {PATIENCE_S} s", "")
+    if (compiled := work / KERNELS).is_dir():
+        shutil.copytree(compiled, made / KERNELS, dirs_exist_ok=True)  # the next cell need not compile them
     wrong = [f"code {done.returncode}"] if done.returncode not in DOCUMENTED else []
     wrong += ["a traceback"] if "Traceback" in done.stderr else []
     wrong += ["its error has no four parts"] if done.returncode in (2, 4, 5) and not _has_four_parts(done.stderr + done.stdout) else []

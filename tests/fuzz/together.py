@@ -6,6 +6,7 @@ import io
 import json
 import random
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import pyarrow as pa
@@ -15,6 +16,7 @@ from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS_TABLE, STEPS_TABLE, 
 
 Files = dict[str, bytes]
 Tables = dict[str, pa.Table]
+Texts = dict[str, str]
 SCHEMAS = (ROLLOUTS_TABLE, STEPS_TABLE)
 NAMES = ("", "x" * 5000, "../../../etc/passwd", "\x1b[31m", "<script>alert(1)</script>", "a/b", "nan", "\u202e", "clean", "null", " ", "\n")
 NUMBERS = (1e308, -1e308, float("inf"), float("-inf"), float("nan"), 1e-308, -1.0, 0.0, 1e9, 0.5)
@@ -29,11 +31,11 @@ def damaged_together(files: Files, rng: random.Random, root: str = "run/") -> Fi
         rng: Where chance comes from.
         root: Of the run folder.
     """
-    tables = {one.name: pq.read_table(io.BytesIO(files[root + one.name])) for one in SCHEMAS}
-    documents = {name: json.loads(data) for name, data in files.items() if name.endswith(".json")}
+    tables = {one.name: _table(files[root + one.name]) for one in SCHEMAS}
+    documents = {name: data.decode() for name, data in files.items() if name.endswith(".json")}
     for _ in range(rng.choice((1, 1, 2, 3))):
         rng.choice(CHANGES)(tables, documents, rng)
-    out = files | {name: json.dumps(document).encode() for name, document in documents.items()}
+    out = files | {name: document.encode() for name, document in documents.items()}
     for name, table in tables.items():
         sink = io.BytesIO()
         pq.write_table(table, sink)
@@ -41,7 +43,7 @@ def damaged_together(files: Files, rng: random.Random, root: str = "run/") -> Fi
     return out
 
 
-def _rename(tables: Tables, documents: dict[str, Any], rng: random.Random) -> None:
+def _rename(tables: Tables, documents: Texts, rng: random.Random) -> None:
     """Rename a renderer, policy, scene, status or metric wherever it stands."""
     column = rng.choice([c.name for c in ROLLOUTS_TABLE.columns if c.kind == "text" and c.name in tables[ROLLOUTS_TABLE.name].column_names])
     values = [v for v in tables[ROLLOUTS_TABLE.name][column].to_pylist() if isinstance(v, str)]
@@ -55,7 +57,7 @@ def _rename(tables: Tables, documents: dict[str, Any], rng: random.Random) -> No
     _replace(documents, old, new)
 
 
-def _rename_metric(tables: Tables, documents: dict[str, Any], rng: random.Random) -> None:
+def _rename_metric(tables: Tables, documents: Texts, rng: random.Random) -> None:
     table = tables[ROLLOUTS_TABLE.name]
     metrics = metrics_in(table.column_names)
     if not metrics:
@@ -70,7 +72,7 @@ def _rename_metric(tables: Tables, documents: dict[str, Any], rng: random.Random
     _replace(documents, old, new)
 
 
-def _extreme(tables: Tables, documents: dict[str, Any], rng: random.Random) -> None:
+def _extreme(tables: Tables, documents: Texts, rng: random.Random) -> None:
     """Set values of a column to extreme ones, in all tables that have it."""
     column = rng.choice(_columns(tables))
     choices: tuple[Any, ...] = {"text": NAMES, "integer": WHOLES, "number": NUMBERS, "flag": (True, False)}[column.kind]
@@ -82,7 +84,7 @@ def _extreme(tables: Tables, documents: dict[str, Any], rng: random.Random) -> N
             tables[name] = _with(table, column.name, found, types[column.kind])
 
 
-def _other_type(tables: Tables, documents: dict[str, Any], rng: random.Random) -> None:
+def _other_type(tables: Tables, documents: Texts, rng: random.Random) -> None:
     column, kind = rng.choice(_columns(tables)), rng.randrange(5)
     for name, table in tables.items():
         if column.name in table.column_names:
@@ -91,14 +93,14 @@ def _other_type(tables: Tables, documents: dict[str, Any], rng: random.Random) -
             tables[name] = _set(table, column.name, pa.array(arrays[kind]))
 
 
-def _drop_column(tables: Tables, documents: dict[str, Any], rng: random.Random) -> None:
+def _drop_column(tables: Tables, documents: Texts, rng: random.Random) -> None:
     column = rng.choice(_columns(tables))
     for name, table in tables.items():
         if column.name in table.column_names:
             tables[name] = table.drop_columns([column.name])
 
 
-def _rows(tables: Tables, documents: dict[str, Any], rng: random.Random) -> None:
+def _rows(tables: Tables, documents: Texts, rng: random.Random) -> None:
     """Remove or repeat the rows of one cell, in both tables, or all rows."""
     table = tables[ROLLOUTS_TABLE.name]
     if not table.num_rows or any(key not in table.column_names for key in KEYS):
@@ -136,19 +138,12 @@ def _set(table: pa.Table, column: str, array: pa.Array) -> pa.Table:
     return table.set_column(table.column_names.index(column), column, array)
 
 
-def _replace(node: Any, old: str, new: str) -> None:
-    """Replace a text in documents, as value and as key."""
-    if isinstance(node, dict):
-        for key in list(node):
-            _replace(node[key], old, new)
-            value = new if node[key] == old and isinstance(node[key], str) else node[key]
-            if key == old:
-                del node[key]
-                node[new] = value
-            else:
-                node[key] = value
-    elif isinstance(node, list):
-        for i, value in enumerate(node):
-            _replace(value, old, new)
-            if isinstance(value, str) and value == old:
-                node[i] = new
+def _replace(documents: Texts, old: str, new: str) -> None:
+    """Replace a text in documents, as value and as key: no other place of JSON has it between bare quotes."""
+    for name, text in documents.items():
+        documents[name] = text.replace(json.dumps(old), json.dumps(new))
+
+
+@cache
+def _table(data: bytes) -> pa.Table:
+    return pq.read_table(io.BytesIO(data))
