@@ -1,6 +1,9 @@
 """What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
 
-    a_k       = A (y + C_k)                                         C_k: what reference k shows beside the render, at 1/4; y: the U-Net
+    s_k       = act(y + C_k)                                        C_k: what reference k shows beside the render, at 1/4; y: the U-Net
+    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are (Sun et al., 2018,
+                                                                    PWC-Net, Sec. 3, cost volume)
+    a_k       = A (s_k, m_k)
     f_k       = act(H (fine + E_k + U a_k))                         E_k: the same at 1/2; fine: the detail path
     w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
     o_k       = 8 px tanh (D a_k + d)                               a misplaced reference is seen at 1/4, its edges at 1/2
@@ -26,6 +29,7 @@ CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail pa
 CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
 OFFSET_PX = 8.0  # largest learned offset
 NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
+MATCH_CELLS, MATCH_CHANNELS = 2, 16  # how far a reference is compared with the picture, in cells; of the features compared
 DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
 
 
@@ -60,13 +64,16 @@ class ReferenceBlend(nn.Module):
         self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
         self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
         self.coarse = nn.Linear(CELL**2 * CHANNELS, coarse)
+        self.sought = nn.Linear(coarse, MATCH_CHANNELS, bias=False)
+        self.shown = Conv3(coarse, MATCH_CHANNELS)
+        self.match = nn.Linear((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
         self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
         self.shift = nn.Linear(width, 2)
         self.up = Upsample(width, detail)
         self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
-        self.write = Conv3(width, DETAIL**2 + 2 + DETAIL**2 * 3)
-        for layer in (self.stem, self.read, self.shift, self.up, self.write):
+        self.write = nn.Linear(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        for layer in (self.stem, self.read, self.match, self.shift, self.up, self.write):
             nn.init.zeros_(layer.weight)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
@@ -89,15 +96,33 @@ class ReferenceBlend(nn.Module):
         """
         b = y.shape[0]
         k = beside.each4.shape[0] // b
-        at4 = activation(_repeated(y, k) + self.coarse(beside.each4.to(y.dtype)), inplace=True)
-        for conv in self.align:
-            at4 = activation(conv(at4), inplace=True)
+        side = activation(_repeated(y, k) + self.coarse(beside.each4.to(y.dtype)), inplace=True)
+        alike = likeness(_repeated(self.sought(y), k), self.shown(side))
+        at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
+        at4 = activation(self.align[1](at4), inplace=True)
         joined = _repeated(fine, k) + self.own(beside.each2.to(fine.dtype)) + self.up(at4)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
         weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
         seen_at4 = F.interpolate(self.shift(at4).float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
         offset_px = torch.tanh(offset + seen_at4.permute(0, 2, 3, 1).view(offset.shape)) * OFFSET_PX
         return BlendHeads(weight, offset_px, correction)
+
+
+def likeness(sought: Tensor, shown: Tensor) -> Tensor:
+    """Compare features with those of the cells around, the mean of products over channels.
+
+    Args:
+        sought: ``(N, h, w, C)``.
+        shown: The same; beyond the border nothing is alike.
+
+    Returns:
+        ``(N, h, w, (2 MATCH_CELLS + 1)^2)`` by row and column of the other cell.
+    """
+    h, w = sought.shape[1:3]
+    reach = 2 * MATCH_CELLS + 1
+    around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
+    alike = [(sought * around[:, i : i + h, j : j + w]).mean(dim=-1) for i in range(reach) for j in range(reach)]
+    return torch.stack(alike, dim=-1)
 
 
 def mix(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
