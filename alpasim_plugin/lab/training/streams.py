@@ -36,7 +36,7 @@ P_BETTER, BETTER = 0.25, (0.2, 0.95)  # a render is moved this far to the truth:
 P_GREY = 0.06  # recordings without colour
 # A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
 # render is the truth, moved by a smooth field; where it doubles, the mean of two.
-P_MOVED, MOVED_PX, P_DOUBLED = 0.15, (0.5, 4.0), 0.5
+P_MOVED, MOVED_PX, P_DOUBLED = 0.15, (0.3, 2.5), 0.5
 P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
 # Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
 P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
