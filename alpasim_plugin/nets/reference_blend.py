@@ -1,8 +1,8 @@
 """What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
 
     s_k       = act(y + C_k)                                        C_k: what reference k shows beside the render, at 1/4; y: the U-Net
-    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are (Sun et al., 2018,
-                                                                    PWC-Net, Sec. 3, cost volume)
+    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are
+                                                                    (cost volume; Sun et al., 2018, PWC-Net, Sec. 3)
     a_k       = A (s_k, m_k)
     f_k       = act(H (fine + E_k + U a_k))                         E_k: the same at 1/2; fine: the detail path
     w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
@@ -125,26 +125,44 @@ def likeness(sought: Tensor, shown: Tensor) -> Tensor:
     return torch.stack(alike, dim=-1)
 
 
-def mix(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
-    """Blend the picture with its references.
+class Sources(NamedTuple):
+    """What a picture is blended of: the generator's own, then each reference."""
+
+    colour: Tensor  # (B, 1 + K, H, W, 3)
+    logit: Tensor  # (B, 1 + K, H, W, 1) their softmax over the sources is the blend
+    holds: Tensor  # (B, 1 + K, H, W, 1) where each holds, above 0 to 1
+
+
+def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads) -> Sources:
+    """Return what the picture is blended of.
 
     Args:
         repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
         references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
         heads: Of the same.
-
-    Returns:
-        ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
     moved = _sampled(references.flatten(0, 1), offset_px)
     colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
-    logits = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
-    shares = torch.cat([torch.zeros_like(logits[:, :1]), logits], dim=1).softmax(dim=1)
-    out = shares[:, 0] * repaired + (shares[:, 1:] * colour).sum(dim=1)
-    return out, 1 - shares[:, 0]
+    logit = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
+    own = torch.zeros_like(logit[:, :1])
+    return Sources(
+        torch.cat([repaired[:, None], colour], dim=1),
+        torch.cat([own, logit], dim=1),
+        torch.cat([own + 1, holds.view(b, k, h, w, 1)], dim=1),
+    )
+
+
+def mix(sources: Sources) -> tuple[Tensor, Tensor]:
+    """Blend the sources of a picture.
+
+    Returns:
+        ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
+    """
+    shares = sources.logit.softmax(dim=1)
+    return (shares * sources.colour).sum(dim=1), 1 - shares[:, 0]
 
 
 def gather_beside(references: Tensor, render: Tensor) -> BesideCells:
