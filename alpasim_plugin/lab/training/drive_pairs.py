@@ -41,7 +41,7 @@ SIDE_PX = 16  # heights are cut at the middle to a multiple of it
 
 
 @dataclass(frozen=True, eq=False)
-class _Shot:
+class Shot:
     """A photograph at the size of the pairs."""
 
     photograph: Photograph
@@ -50,6 +50,7 @@ class _Shot:
 
     @classmethod
     def read(cls, one: Photograph, width: int) -> Self:
+        """Read a photograph at a width in pixels, never larger than it is."""
         whole = photograph_camera(one, width)
         height = whole.height // SIDE_PX * SIDE_PX
         top = (whole.height - height) // 2
@@ -58,10 +59,12 @@ class _Shot:
         return cls(one, PinholeCamera(whole.width, height, K, whole.T_camera_world), rgb)
 
     def spec(self, scenario: Scenario) -> CameraSpec:
+        """Return its camera on the rig."""
         T_rig_camera = inverse(interpolate(scenario.ego_log, self.photograph.t_us)) @ self.photograph.T_world_camera
         return CameraSpec(self.photograph.camera, self.camera.width, self.camera.height, self.camera.K, T_rig_camera)
 
     def view(self, scenario: Scenario, i: int) -> PosedView:
+        """Return it as the ``i``-th view to fit to."""
         actors = log_actors(scenario, self.photograph.t_us)
         return PosedView(self.camera, self.rgb, f"{self.photograph.camera}-{i:06d}", actors=actors)
 
@@ -90,7 +93,7 @@ def make_drive_pairs(scenario: Scenario, name: str, out: Path, recipe: Photograp
             info = _info(scenario, camera, recipe, phase)
             made = not is_made(folder, info)
             if made:
-                shots = [_Shot.read(one, recipe.width) for one in taken]
+                shots = [Shot.read(one, recipe.width) for one in taken]
                 _write(scenario, shots, points, folder, recipe, phase, info, threads)
             yield PhotographPairs(folder, made, PairSequence(folder).info["psnr_db"])
 
@@ -105,7 +108,7 @@ def _info(scenario: Scenario, camera: str, recipe: PhotographRecipe, phase: int)
 
 def _write(
     scenario: Scenario,
-    shots: Sequence[_Shot],
+    shots: Sequence[Shot],
     points: GaussianCloud,
     folder: Path,
     recipe: PhotographRecipe,
@@ -117,21 +120,37 @@ def _write(
     fitted = [shot for i, shot in enumerate(shots) if i % recipe.every != phase]
     with tempfile.TemporaryDirectory(prefix="simrun-pairs-") as scratch:
         known = _fitted(scenario, fitted, points, Path(scratch), recipe, phase, threads)
-        renderer = make_renderer("3dgs", known, seed=recipe.seed, threads=threads)
-        geometry: list[FrameGeometry] = []
-        pairs = list(_frames(known, held, renderer, geometry))
-        recorded = [_recorded(known, shot, renderer) for shot in fitted]
-        lens = shots[0].spec(scenario)
-        facts = {"width": lens.width, "height": lens.height, "K": lens.K.tolist(), "T_rig_camera": lens.T_rig_camera.tolist()}
-        psnr = {"held_out": round(float(np.mean([psnr_db(pair.rgb_input, pair.rgb_gt) for pair in pairs])), 3)}
-        write_sequence(
-            folder, pairs, len(pairs), {**info, "camera": facts, "psnr_db": psnr},
-            lambda partial: write_references(partial, geometry, recorded, scenario.actors),
-        )  # fmt: skip
+        write_drive_sequence(known, held, fitted, folder, info, threads)
+
+
+def write_drive_sequence(
+    scenario: Scenario, shown: Sequence[Shot], recorded: Sequence[Shot], folder: Path, info: dict[str, Any], threads: int
+) -> None:
+    """Write what a drive's model shows where photographs were taken, those photographs, and its recording.
+
+    Args:
+        scenario: With the model.
+        shown: The frames of the sequence, in order of time.
+        recorded: Its recording. A photograph that is in both is never its own reference in training.
+        folder: ROOT/SPLIT/SEQUENCE.
+        info: Of sequence.json.
+        threads: Of the rasteriser.
+    """
+    renderer = make_renderer("3dgs", scenario, seed=int(info["seed"]), threads=threads)
+    geometry: list[FrameGeometry] = []
+    pairs = list(_frames(scenario, shown, renderer, geometry))
+    frames = [_recorded(scenario, shot, renderer) for shot in recorded]
+    lens = shown[0].spec(scenario)
+    facts = {"width": lens.width, "height": lens.height, "K": lens.K.tolist(), "T_rig_camera": lens.T_rig_camera.tolist()}
+    psnr = {"held_out": round(float(np.mean([psnr_db(pair.rgb_input, pair.rgb_gt) for pair in pairs])), 3)}
+    write_sequence(
+        folder, pairs, len(pairs), {**info, "camera": facts, "psnr_db": psnr},
+        lambda partial: write_references(partial, geometry, frames, scenario.actors),
+    )  # fmt: skip
 
 
 def _fitted(
-    scenario: Scenario, shots: Sequence[_Shot], points: GaussianCloud, scratch: Path, recipe: PhotographRecipe, phase: int, threads: int
+    scenario: Scenario, shots: Sequence[Shot], points: GaussianCloud, scratch: Path, recipe: PhotographRecipe, phase: int, threads: int
 ) -> Scenario:
     """Return the scenario with a model that was fitted to these photographs alone."""
     views = [shot.view(scenario, i) for i, shot in enumerate(shots)]
@@ -152,7 +171,7 @@ def _fitted(
     return replace(scenario, model=str(scratch), recording=tuple(recording))
 
 
-def _frames(scenario: Scenario, shots: Sequence[_Shot], renderer: Renderer, geometry: list[FrameGeometry]) -> Iterator[Pair]:
+def _frames(scenario: Scenario, shots: Sequence[Shot], renderer: Renderer, geometry: list[FrameGeometry]) -> Iterator[Pair]:
     """Yield the pairs, and append depth and actors of each to ``geometry``."""
     layers = prepare_map(scenario.lane_map)
     for shot in shots:
@@ -167,7 +186,7 @@ def _frames(scenario: Scenario, shots: Sequence[_Shot], renderer: Renderer, geom
         yield Pair(frame.rgb, shot.rgb, opacity, sdmap, T, t_us)
 
 
-def _recorded(scenario: Scenario, shot: _Shot, renderer: Renderer) -> RecordedFrame:
+def _recorded(scenario: Scenario, shot: Shot, renderer: Renderer) -> RecordedFrame:
     one = shot.photograph
     actors = log_actors(scenario, one.t_us)
 

@@ -76,8 +76,9 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
     K[:2, 2] -= (columns.start, rows.start)
     last: Sequence[int] = ()
     for t, i in enumerate(index):
-        chosen = recorded.choose(references.T_world_camera[i], int(references.t_us[i]), draw.skipped + draw.count, last)
-        last = chosen
+        wanted, t_us = draw.skipped + draw.count, int(references.t_us[i])
+        last = recorded.choose(references.T_world_camera[i], t_us, wanted + 1, last)
+        chosen = [j for j in last if references.rgb_t_us[j] != t_us][:wanted]  # a photograph is not its own reference
         target = references.target(int(i), K, rows, columns)
         for slot, j in enumerate(chosen[draw.skipped :]):
             at = (j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j
