@@ -25,7 +25,7 @@ from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.lab.bench.quality import Variant, run_variant
 from alpasim_plugin.lab.bench.quality_run import quality_clip
-from alpasim_plugin.lab.training.drive_pairs import SIDE_PX, Shot, write_drive_sequence
+from alpasim_plugin.lab.training.drive_pairs import DRIVE, SIDE_PX, Shot, write_drive_sequence
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.pixel_rollout import Distance
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
@@ -117,7 +117,7 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
     fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
     held = [shot for shot in shots if shot.photograph.use == "held-out"]
     for split, shown in (("train", fitted), ("judge", held)):
-        info: dict[str, Any] = {"scene_id": scenario.scene_id, "seed": seed, "split": split, "family": "drive"}
+        info: dict[str, Any] = {"scene_id": scenario.scene_id, "seed": seed, "split": split, "family": DRIVE}
         write_drive_sequence(scenario, shown, fitted, root / "pairs" / split / "drive_0", info, threads=1)
     return PairSequence(root / "pairs" / "judge" / "drive_0")
 

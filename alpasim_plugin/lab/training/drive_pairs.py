@@ -37,6 +37,7 @@ from alpasim_plugin.renderers.recorded import photograph_camera, photograph_pict
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 
+DRIVE = "drive"  # the family of these sequences
 SIDE_PX = 16  # heights are cut at the middle to a multiple of it
 
 
@@ -100,8 +101,8 @@ def make_drive_pairs(scenario: Scenario, name: str, out: Path, recipe: Photograp
 
 def _info(scenario: Scenario, camera: str, recipe: PhotographRecipe, phase: int) -> dict[str, Any]:
     return {
-        "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": recipe.seed, "split": recipe.split, "family": "drive",
-        "actors": len(scenario.actors), "moving_actors": 0, "degradation": {"kind": "drive"}, "recipe": asdict(recipe),
+        "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": recipe.seed, "split": recipe.split, "family": DRIVE,
+        "actors": len(scenario.actors), "moving_actors": 0, "degradation": {"kind": DRIVE}, "recipe": asdict(recipe),
         "name_of_camera": camera, "phase": phase,
     }  # fmt: skip
 

@@ -21,6 +21,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, I64, U8
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
+from alpasim_plugin.lab.training.drive_pairs import DRIVE
 from alpasim_plugin.lab.training.episode_references import ReferenceDraw, draw_references, pair_references, smooth_field, video_references
 from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
 from alpasim_plugin.lab.training.map_errors import MapError, draw_map_error, with_error
@@ -33,10 +34,11 @@ SIDE = 16  # crops are multiples of it
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
 P_BETTER, BETTER = 0.25, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
+P_DRIVE = 0.3  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
 P_GREY = 0.06  # recordings without colour
 # A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
 # render is the truth, moved by a smooth field; where it doubles, the mean of two.
-P_MOVED, MOVED_PX, P_DOUBLED = 0.15, (0.3, 2.5), 0.5
+P_MOVED, MOVED_PX, P_DOUBLED = 0.2, (0.3, 2.5), 0.5
 P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
 # Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
 P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
@@ -168,6 +170,7 @@ class TrainingStreams:
             asked = f"batch {batch}, frames {frames}, episode {episode}, crop {crop}"
             raise InputError(DOING, asked, "no batch", f"give at least one of each, and a crop in multiples of {SIDE}")
         self.pairs = _in_order(PairDataset(pairs, split).sequences)[:count]
+        self.drives = tuple(sequence for sequence in self.pairs if sequence.info.get("family") == DRIVE)
         needs_video = self.shares.video + self.shares.damaged_video > 0
         if needs_video and video is None:
             raise InputError(DOING, f"{self.shares}", "no folder of videos", "make one with 'simrun train video', or give them no share")
@@ -203,6 +206,8 @@ class TrainingStreams:
         rng = stream("training", self.seed, f"streams.{slot}", number)
         kind = int(rng.choice(len(KINDS), p=[getattr(self.shares, name) for name in KINDS]))
         sequences = self.videos if KINDS[kind] in ("video", "damaged_video") else self.pairs
+        if KINDS[kind] == "pairs" and self.drives and rng.random() < P_DRIVE:
+            sequences = self.drives
         sequence = sequences[int(rng.integers(len(sequences)))]
         length, height, width = sequence.clip.rgb_gt.shape[:3]
         start, top, left = (int(rng.integers(n)) for n in (length, height - self.crop[0] + 1, width - self.crop[1] + 1))

@@ -215,3 +215,11 @@ def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_bett
     shown = _lit_references(images, exact)
     assert np.abs(shown[..., :3] - (images[..., :3] / 127.5 - 1)).max() < 1e-5
     assert np.array_equal(_lit_references(images, replace(exact, flip=True)), shown[:, :, :, ::-1])
+
+
+def test_recorded_streets_are_shown_more_often_than_their_number(tmp_path: Path) -> None:
+    for i in range(8):
+        make(tmp_path / "pairs", name=f"street_{i:03d}", frames=6, family="drive" if i == 0 else "street")
+    made = streams(tmp_path, shares=StreamShares(1, 0, 0, 0))
+    shown = [made.episode_of(slot, i)[0].sequence.info["family"] for slot in range(3) for i in range(0, 400, 4)]
+    assert 0.25 < np.mean([family == "drive" for family in shown]) < 0.55
