@@ -100,7 +100,7 @@ def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root
 def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
     made = streams(root)
     seen = set()
-    for i in range(0, 48, 4):
+    for i in range(0, 120, 4):
         batch = made.update(i)
         for slot, kind in enumerate(batch.kind.tolist()):
             (episode, at) = made.episode_of(slot, i)
@@ -127,7 +127,7 @@ def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
 def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     compared = 0
-    for i in range(0, 48, 4):
+    for i in range(0, 120, 4):
         (episode, at), batch = made.episode_of(0, i), made.update(i)
         if episode.better or episode.moved_px or episode.grey:
             continue
