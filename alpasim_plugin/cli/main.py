@@ -47,7 +47,7 @@ GROUPS: dict[str, dict[str, str]] = {
 }  # fmt: skip
 PLUGINS = "From installed packages"
 GROUP = "simrun.commands"
-OF_EXTRA = {"train": "lab", "judge": "lab", "bench": "lab"}  # verbs that an optional package of ours brings
+OF_EXTRA = {"adapt": "lab", "train": "lab", "judge": "lab", "bench": "lab"}  # verbs that an optional package of ours brings
 OWN_OPTIONS = ("--help", "--version", "--install-completion", "--show-completion")
 PIPE_CLOSED = 141  # as shells count a process that SIGPIPE ended
 READING = "reading the command line"

@@ -35,7 +35,17 @@ from alpasim_plugin.nets.pixel_layers import (
     repeat_per_pixel,
     small,
 )
-from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BesideCells, BlendHeads, ReferenceBlend, gather_beside, mix
+from alpasim_plugin.nets.reference_blend import (
+    CELL,
+    DETAIL,
+    BesideCells,
+    BlendHeads,
+    ReferenceBlend,
+    Sources,
+    gather_beside,
+    mix,
+    sources_of,
+)
 
 GRID_PX = 16  # sides are multiples of it
 IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
@@ -201,18 +211,28 @@ class PixelGenerator(nn.Module):
         Returns:
             ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
         """
-        return self.from_cells(gather_cells(render, opacity, sdmap, state, source), render, state, t, references)
+        out, after, _ = self.with_sources(render, opacity, sdmap, state, source, t, references)
+        return out, after
 
-    def from_cells(
-        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, references: Tensor | None = None
-    ) -> tuple[Tensor, PixelState]:
-        """Predict the clean frame from what `gather_cells` gathered; see `forward`."""
+    def with_sources(
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        state: PixelState,
+        source: Tensor | None = None,
+        t: Tensor | None = None,
+        references: Tensor | None = None,
+    ) -> tuple[Tensor, PixelState, Sources | None]:
+        """Predict the clean frame and say what it was blended of; None without references. See `forward`."""
+        gathered = gather_cells(render, opacity, sdmap, state, source)
         beside = None if self.blend is None or references is None else gather_beside(references, render)
         made = self.before_blend(gathered, render, state, t, beside)
-        out, recorded = made.repaired, torch.zeros_like(render[..., :1])
+        out, recorded, sources = made.repaired, torch.zeros_like(render[..., :1]), None
         if made.heads is not None and references is not None:
-            out, recorded = mix(made.repaired, references, made.heads)
-        return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
+            sources = sources_of(made.repaired, references, made.heads)
+            out, recorded = mix(sources)
+        return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded), sources
 
     def before_blend(
         self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, beside: BesideCells | None = None

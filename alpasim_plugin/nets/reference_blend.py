@@ -1,6 +1,9 @@
 """What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
 
-    a_k       = A (y + C_k)                                         C_k: what reference k shows beside the render, at 1/4; y: the U-Net
+    s_k       = act(y + C_k)                                        C_k: what reference k shows beside the render, at 1/4; y: the U-Net
+    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are
+                                                                    (cost volume; Sun et al., 2018, PWC-Net, Sec. 3)
+    a_k       = A (s_k, m_k)
     f_k       = act(H (fine + E_k + U a_k))                         E_k: the same at 1/2; fine: the detail path
     w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
     o_k       = 8 px tanh (D a_k + d)                               a misplaced reference is seen at 1/4, its edges at 1/2
@@ -26,6 +29,7 @@ CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail pa
 CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
 OFFSET_PX = 8.0  # largest learned offset
 NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
+MATCH_CELLS, MATCH_CHANNELS = 2, 16  # how far a reference is compared with the picture, in cells; of the features compared
 DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
 
 
@@ -60,13 +64,16 @@ class ReferenceBlend(nn.Module):
         self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
         self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
         self.coarse = nn.Linear(CELL**2 * CHANNELS, coarse)
+        self.sought = nn.Linear(coarse, MATCH_CHANNELS, bias=False)
+        self.shown = Conv3(coarse, MATCH_CHANNELS)
+        self.match = nn.Linear((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
         self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
         self.shift = nn.Linear(width, 2)
         self.up = Upsample(width, detail)
         self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
-        self.write = Conv3(width, DETAIL**2 + 2 + DETAIL**2 * 3)
-        for layer in (self.stem, self.read, self.shift, self.up, self.write):
+        self.write = nn.Linear(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        for layer in (self.stem, self.read, self.match, self.shift, self.up, self.write):
             nn.init.zeros_(layer.weight)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
@@ -89,9 +96,10 @@ class ReferenceBlend(nn.Module):
         """
         b = y.shape[0]
         k = beside.each4.shape[0] // b
-        at4 = activation(_repeated(y, k) + self.coarse(beside.each4.to(y.dtype)), inplace=True)
-        for conv in self.align:
-            at4 = activation(conv(at4), inplace=True)
+        side = activation(_repeated(y, k) + self.coarse(beside.each4.to(y.dtype)), inplace=True)
+        alike = likeness(_repeated(self.sought(y), k), self.shown(side))
+        at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
+        at4 = activation(self.align[1](at4), inplace=True)
         joined = _repeated(fine, k) + self.own(beside.each2.to(fine.dtype)) + self.up(at4)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
         weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
@@ -100,26 +108,61 @@ class ReferenceBlend(nn.Module):
         return BlendHeads(weight, offset_px, correction)
 
 
-def mix(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
-    """Blend the picture with its references.
+def likeness(sought: Tensor, shown: Tensor) -> Tensor:
+    """Compare features with those of the cells around, the mean of products over channels.
+
+    Args:
+        sought: ``(N, h, w, C)``.
+        shown: The same; beyond the border nothing is alike.
+
+    Returns:
+        ``(N, h, w, (2 MATCH_CELLS + 1)^2)`` by row and column of the other cell.
+    """
+    h, w = sought.shape[1:3]
+    reach = 2 * MATCH_CELLS + 1
+    around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
+    alike = [(sought * around[:, i : i + h, j : j + w]).mean(dim=-1) for i in range(reach) for j in range(reach)]
+    return torch.stack(alike, dim=-1)
+
+
+class Sources(NamedTuple):
+    """What a picture is blended of: the generator's own, then each reference."""
+
+    colour: Tensor  # (B, 1 + K, H, W, 3)
+    logit: Tensor  # (B, 1 + K, H, W, 1) their softmax over the sources is the blend
+    holds: Tensor  # (B, 1 + K, H, W, 1) where each holds, above 0 to 1
+
+
+def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads) -> Sources:
+    """Return what the picture is blended of.
 
     Args:
         repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
         references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
         heads: Of the same.
-
-    Returns:
-        ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
     moved = _sampled(references.flatten(0, 1), offset_px)
     colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
-    logits = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
-    shares = torch.cat([torch.zeros_like(logits[:, :1]), logits], dim=1).softmax(dim=1)
-    out = shares[:, 0] * repaired + (shares[:, 1:] * colour).sum(dim=1)
-    return out, 1 - shares[:, 0]
+    logit = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
+    own = torch.zeros_like(logit[:, :1])
+    return Sources(
+        torch.cat([repaired[:, None], colour], dim=1),
+        torch.cat([own, logit], dim=1),
+        torch.cat([own + 1, holds.view(b, k, h, w, 1)], dim=1),
+    )
+
+
+def mix(sources: Sources) -> tuple[Tensor, Tensor]:
+    """Blend the sources of a picture.
+
+    Returns:
+        ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
+    """
+    shares = sources.logit.softmax(dim=1)
+    return (shares * sources.colour).sum(dim=1), 1 - shares[:, 0]
 
 
 def gather_beside(references: Tensor, render: Tensor) -> BesideCells:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, mix_cpu
 from alpasim_plugin.nets.pixel_generator import PixelState, gather_cells
-from alpasim_plugin.nets.reference_blend import BlendHeads, gather_beside, mix
+from alpasim_plugin.nets.reference_blend import BlendHeads, gather_beside, mix, sources_of
 
 
 def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Tensor, Tensor, PixelState]:
@@ -61,7 +61,7 @@ def test_one_pass_mixes_as_the_operations_one_by_one(batch: int, references: int
     heads = BlendHeads(*(torch.randn(*at2, n, generator=draw) * size for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))))
     for one, other in zip(gather_beside_cpu(images, repaired), gather_beside(images, repaired), strict=True):
         assert torch.allclose(one, other, atol=1e-6)
-    fast, plain = mix_cpu(repaired, images, heads), mix(repaired, images, heads)
+    fast, plain = mix_cpu(repaired, images, heads), mix(sources_of(repaired, images, heads))
     assert torch.allclose(fast[0], plain[0], atol=2e-5)
     assert torch.allclose(fast[1], plain[1], atol=2e-5)
 

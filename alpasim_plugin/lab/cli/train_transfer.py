@@ -12,12 +12,16 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives.build import SCENARIO_FILE
 from alpasim_plugin.gaussians.fit.photographs import read_photographs
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug
+from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
 from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe, make_photograph_pairs
 from alpasim_plugin.lab.training.transfer_pairs import make_transfer_sequence
 from alpasim_plugin.lab.training.transfer_scenes import SPLITS, Split, TransferScene, check_frozen, transfer_scene
 from alpasim_plugin.runtime.executors.local import map_jobs
+from scenarios.drive import DRIVE_FILE
+from scenarios.load import load_scenario
 
 PHOTOGRAPHS_EPILOG = "Example: `simrun train photographs photos/ --out data/photographs`"
 TRANSFER_EPILOG = "Example: `simrun train transfer --out data/transfer --jobs 2`"
@@ -50,7 +54,7 @@ def transfer(
 
 
 def photographs(
-    folder: Annotated[Path, typer.Argument(help="Folder with images and the transforms.json of Instant-NGP.")],
+    folder: Annotated[Path, typer.Argument(help="Folder with images and the transforms.json of Instant-NGP, or an imported drive.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")],
     name: Annotated[str | None, typer.Option("--name", help="Of the sequences; the folder's by default.")] = None,
     split: Annotated[str, typer.Option("--split", help="Split of the sequences.")] = "test",
@@ -63,21 +67,27 @@ def photographs(
 ) -> None:
     """Fit an under-trained reconstruction to posed photographs and write it beside them as pairs; the map is black.
 
-    Photographs that the file lists and the folder lacks are named and left out.
+    Photographs that the file lists and the folder lacks are named and left out. Of an imported drive the pairs are the held-out photographs
+    alone, with its map, and with the photographs that were fitted as recorded frames.
     """
     del debug
     console, rows = Console(stderr=True), []
-    found = read_photographs(folder, width)
-    if found.missing:
-        shown = ", ".join(found.missing[:5]) + (", ..." if len(found.missing) > 5 else "")
-        console.print(f"{len(found.missing)} of {found.listed} listed images are missing: {shown}", highlight=False, markup=False)
-    recipe = PhotographRecipe(width, every, steps, split=split, seed=seed)
-    for one in make_photograph_pairs(found, name or folder.resolve().name, out, recipe):
+    missing: tuple[str, ...] = ()
+    recipe, named = PhotographRecipe(width, every, steps, split=split, seed=seed), name or folder.resolve().name
+    if (folder / DRIVE_FILE).is_file():
+        made = make_drive_pairs(load_scenario(str(folder / SCENARIO_FILE)), named, out, recipe)
+    else:
+        found = read_photographs(folder, width)
+        missing, made = found.missing, make_photograph_pairs(found, named, out, recipe)
+    if missing:
+        shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+        console.print(f"{len(missing)} of the listed images are missing: {shown}", highlight=False, markup=False)
+    for one in made:
         rows.append({"folder": str(one.folder), "made": one.made, "psnr_db": dict(one.psnr_db)})
         quality = ", ".join(f"{key.replace('_', ' ')} {value:.2f} dB" for key, value in one.psnr_db.items())
         console.print(f"{one.folder}{'' if one.made else ' (exists)'}: {quality}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
-        print(json.dumps({"sequences": len(rows), "missing": list(found.missing), "rows": rows}))
+        print(json.dumps({"sequences": len(rows), "missing": list(missing), "rows": rows}))
 
 
 def splits_of(text: str) -> list[Split]:

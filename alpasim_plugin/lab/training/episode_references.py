@@ -76,8 +76,9 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
     K[:2, 2] -= (columns.start, rows.start)
     last: Sequence[int] = ()
     for t, i in enumerate(index):
-        chosen = recorded.choose(references.T_world_camera[i], int(references.t_us[i]), draw.skipped + draw.count, last)
-        last = chosen
+        wanted, t_us = draw.skipped + draw.count, int(references.t_us[i])
+        last = recorded.choose(references.T_world_camera[i], t_us, wanted + 1, last)
+        chosen = [j for j in last if references.rgb_t_us[j] != t_us][:wanted]  # a photograph is not its own reference
         target = references.target(int(i), K, rows, columns)
         for slot, j in enumerate(chosen[draw.skipped :]):
             at = (j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j
@@ -90,7 +91,8 @@ def video_references(clip: PairClip, draw: ReferenceDraw, index: I64, rows: slic
     out = np.zeros((len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8)
     rng = stream("training", draw.seed, "references.video")
     away = rng.integers(*FLOW_FRAMES, SLOTS) * rng.choice([-1, 1], SLOTS)
-    bent = [_smooth(rng, clip.rgb_gt.shape[1:3]) if rng.random() < P_BENT else None for _ in range(SLOTS)]
+    size = clip.rgb_gt.shape[1:3]
+    bent = [smooth_field(rng, size, BENT_PX * rng.random(dtype=np.float32)) if rng.random() < P_BENT else None for _ in range(SLOTS)]
     for t, i in enumerate(index):
         for slot in range(draw.count):
             j = int(i) + int(away[slot])
@@ -117,11 +119,11 @@ def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
     return out
 
 
-def _smooth(rng: np.random.Generator, size: tuple[int, ...]) -> F32:
-    """Draw a smooth error of flow ``(H, W, 2)``, pixels."""
+def smooth_field(rng: np.random.Generator, size: tuple[int, ...], spread_px: float) -> F32:
+    """Draw a smooth field of shifts ``(H, W, 2)``, pixels."""
     height, width = size
     coarse = rng.standard_normal((height // BENT_CELL_PX + 2, width // BENT_CELL_PX + 2, 2)).astype(np.float32)
-    smooth: F32 = BENT_PX * rng.random(dtype=np.float32) * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    smooth: F32 = np.float32(spread_px) * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return smooth
 
 

@@ -5,7 +5,12 @@
     perceptual   d(x^w, x^w_0)                                    at sampled frames w
     temporal     | (x^i - x^i-1) - (x^i_0 - x^i-1_0) |            differences of neighbouring frames
     grid         evenness of steps over the generator's cells     `training.grid_term`
+    choice       - sum_k q_k log p_k                              the blend p of render and references, q: which of them is near the truth
     flow         | v(z^i_t, t | sg(state^<i)) - (z^i_1 - x^i_0) | at sampled frames and times, on the history of the rollout
+
+The choice term is there because a weight near 0 has no gradient through the picture: a blend that never takes a reference would never
+learn when it should. Its aim is q_k = softmax(log v_k - e_k / s), without gradients; e_k is the error of source k around a pixel, and v_k
+says where it holds.
 
 With x_0-prediction, v = (z_t - x_0) / t, so the flow term is the error of x_0 over t. Names as in the paper: ``z_1`` source, ``m`` mask,
 ``eps`` noise, ``sg`` stop-gradient. All random numbers are arguments. The state enters from the batch before and leaves to the next one,
@@ -19,15 +24,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.lab.training.grid_term import grid_term
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
 from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.reference_blend import Sources
 from alpasim_plugin.nets.schedule import interpolant
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
+NEAR, AROUND = 0.04, 5  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
 
@@ -36,7 +44,7 @@ class PixelObjectives:
     """Weights of the terms, and the axes of the ablation.
 
     Args:
-        perceptual, temporal, flow, picture, grid: Weights of the terms; 0 switches a term off.
+        perceptual, temporal, flow, picture, grid, choice: Weights of the terms; 0 switches a term off.
         horizon: k, frames that gradients pass through; 1 cuts the history at every frame.
         history: What the state holds of the past: the generator's ``own`` outputs, the truth in their place (``clean``), or the truth that
             the generator noised and denoised again (``redenoised``; no gradient passes through it).
@@ -53,6 +61,7 @@ class PixelObjectives:
     source: Literal["mixed", "noise", "render"] = "mixed"
     picture: float = 1.0
     grid: float = 0.01
+    choice: float = 0.02
 
     @property
     def in_pixels(self) -> bool:
@@ -103,6 +112,7 @@ class PixelLosses:
     temporal: Tensor
     flow: Tensor
     grid: Tensor
+    choice: Tensor
     predictions: Tensor
     state: PixelState  # after the last frame, detached
 
@@ -121,7 +131,7 @@ def pixel_losses(
     """
     frames = sample.render.shape[1]
     zero = sample.render.new_zeros(())
-    outputs, flow = [], zero
+    outputs, flow, choice = [], zero, zero
     for i in range(frames):
         render, opacity, truth = sample.render[:, i], sample.opacity[:, i], sample.truth[:, i]
         references = None if sample.references is None else sample.references[:, i]
@@ -135,8 +145,10 @@ def pixel_losses(
             state = state.detached()
         before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
-            out, state = net(render, opacity, sdmap, before, source, None, references)
+            out, state, sources = net.with_sources(render, opacity, sdmap, before, source, None, references)
         outputs.append(out)
+        if objectives.choice and sources is not None:
+            choice = choice + choice_term(sources, truth) / frames
         if objectives.history == "clean":
             state = state._replace(output=truth)
         elif objectives.history == "redenoised":
@@ -154,8 +166,18 @@ def pixel_losses(
         perceptual = distance(images[0], images[1]).mean()
     grid = grid_term(made, sample.truth) if objectives.grid else zero
     total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal
-    total = total + objectives.grid * grid + objectives.flow * flow
-    return PixelLosses(total, picture, perceptual, temporal, flow, grid, made, state.detached())
+    total = total + objectives.grid * grid + objectives.flow * flow + objectives.choice * choice
+    return PixelLosses(total, picture, perceptual, temporal, flow, grid, choice, made, state.detached())
+
+
+def choice_term(sources: Sources, truth: Tensor) -> Tensor:
+    """Return how far the blend is from the sources that are near the truth ``(B, H, W, 3)``: cross-entropy, nats."""
+    b, k, h, w, _ = sources.colour.shape
+    with torch.no_grad():
+        error = (sources.colour - truth[:, None]).abs().mean(dim=-1).flatten(0, 1)[:, None]
+        around = F.avg_pool2d(error, AROUND, 1, AROUND // 2, count_include_pad=False).view(b, k, h, w)
+        aim = (sources.holds[..., 0].log() - around / NEAR).softmax(dim=1)
+    return -(aim * sources.logit[..., 0].log_softmax(dim=1)).sum(dim=1).mean()
 
 
 def _source(render: Tensor, opacity: Tensor, eps: Tensor, objectives: PixelObjectives) -> Tensor:

@@ -144,7 +144,7 @@ class PixelTask:
         return found.total, {
             "picture": float(found.picture.detach()), "perceptual": float(found.perceptual.detach()),
             "temporal": float(found.temporal.detach()), "flow": float(found.flow.detach()),
-            "grid": float(found.grid.detach()),
+            "grid": float(found.grid.detach()), "choice": float(found.choice.detach()),
             "psnr_db": float(made.mean()), "gain_db": gain,
         }  # fmt: skip
 

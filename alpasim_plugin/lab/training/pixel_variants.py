@@ -15,7 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives
 
 FULL = PixelObjectives()
-FLOW_ALONE = PixelObjectives(picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0, grid=0.0)
+FLOW_ALONE = PixelObjectives(picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0, grid=0.0, choice=0.0)
 PIXELS_ALONE = replace(FULL, flow=0.0)
 DEPLOYED = "V9"
 

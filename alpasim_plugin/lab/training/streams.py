@@ -21,7 +21,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, I64, U8
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
-from alpasim_plugin.lab.training.episode_references import ReferenceDraw, draw_references, pair_references, video_references
+from alpasim_plugin.lab.training.drive_pairs import DRIVE
+from alpasim_plugin.lab.training.episode_references import ReferenceDraw, draw_references, pair_references, smooth_field, video_references
 from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
 from alpasim_plugin.lab.training.map_errors import MapError, draw_map_error, with_error
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
@@ -33,7 +34,11 @@ SIDE = 16  # crops are multiples of it
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
 P_BETTER, BETTER = 0.25, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
+P_DRIVE = 0.3  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
 P_GREY = 0.06  # recordings without colour
+# A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
+# render is the truth, moved by a smooth field; where it doubles, the mean of two.
+P_MOVED, MOVED_PX, P_DOUBLED = 0.2, (0.3, 2.5), 0.5
 P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
 # Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
 P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
@@ -106,6 +111,8 @@ class Episode:
         lost: In the place of the damage that the sequence was recorded with; None keeps that one.
         references: Which recorded frames are there, and how wrong they are.
         better: How far a render is moved to the truth, 0 to 1.
+        moved_px: By how much the truth is moved where it stands for the render; 0 shows the render.
+        doubled: Whether it is moved in two ways at once.
         grey: Whether all is without colour.
         map_error: What is wrong with the map.
         other: Of which sequence the map is, where it is that of another.
@@ -126,6 +133,8 @@ class Episode:
     lost: LostResolution | None
     references: ReferenceDraw
     better: float
+    moved_px: float
+    doubled: bool
     grey: bool
     map_error: MapError
     other: PairSequence
@@ -161,6 +170,7 @@ class TrainingStreams:
             asked = f"batch {batch}, frames {frames}, episode {episode}, crop {crop}"
             raise InputError(DOING, asked, "no batch", f"give at least one of each, and a crop in multiples of {SIDE}")
         self.pairs = _in_order(PairDataset(pairs, split).sequences)[:count]
+        self.drives = tuple(sequence for sequence in self.pairs if sequence.info.get("family") == DRIVE)
         needs_video = self.shares.video + self.shares.damaged_video > 0
         if needs_video and video is None:
             raise InputError(DOING, f"{self.shares}", "no folder of videos", "make one with 'simrun train video', or give them no share")
@@ -196,6 +206,8 @@ class TrainingStreams:
         rng = stream("training", self.seed, f"streams.{slot}", number)
         kind = int(rng.choice(len(KINDS), p=[getattr(self.shares, name) for name in KINDS]))
         sequences = self.videos if KINDS[kind] in ("video", "damaged_video") else self.pairs
+        if KINDS[kind] == "pairs" and self.drives and rng.random() < P_DRIVE:
+            sequences = self.drives
         sequence = sequences[int(rng.integers(len(sequences)))]
         length, height, width = sequence.clip.rgb_gt.shape[:3]
         start, top, left = (int(rng.integers(n)) for n in (length, height - self.crop[0] + 1, width - self.crop[1] + 1))
@@ -213,12 +225,13 @@ class TrainingStreams:
         loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
         lost = draw_lost_resolution(rng, *self.crop) if loses else None
         references, better = draw_references(rng), float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER)
+        moved_px, doubled = float(rng.uniform(*MOVED_PX)) * (rng.random() < P_MOVED), bool(rng.random() < P_DOUBLED)
         without_colour = rng.random() < P_GREY
         car_class = other if class_colours else None
         map_error, elsewhere = draw_map_error(rng), self.pairs[int(rng.integers(len(self.pairs)))]
         return Episode(
             kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better,
-            without_colour, map_error, elsewhere,
+            moved_px, doubled, without_colour, map_error, elsewhere,
         )  # fmt: skip
 
     def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32]:
@@ -242,6 +255,8 @@ class TrainingStreams:
             render, opacity = episode.lost.apply(target), opacity * episode.lost.opacity
         elif damaged:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
+        if episode.moved_px and kind == "pairs":
+            render, opacity = _moved(target, episode, stream("training", self.seed, f"{episode.key}.moved")), np.ones_like(opacity)
         render = render + np.float32(episode.better) * (target - render)
         drawn = episode.references, index, rows, columns
         recorded = pair_references(episode.sequence, *drawn) if kind in ("pairs", "identity") else video_references(clip, *drawn)
@@ -284,6 +299,18 @@ def _lit_references(references: U8, episode: Episode) -> F32:
     out[..., :3] = np.clip((out[..., :3] + 1) * gains - 1, -1, 1)
     out[..., 3] = flipped[..., 3] / np.float32(255)
     return out * (out[..., 3:] > 0)
+
+
+def _moved(frames: F32, episode: Episode, rng: np.random.Generator) -> F32:
+    """Move what frames ``(T, 3, h, w)`` show by smooth fields, one or the mean of two."""
+    height, width = frames.shape[2:]
+    place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    fields = [place + smooth_field(rng, (height, width), episode.moved_px) for _ in range(1 + episode.doubled)]
+    moved = [
+        [cv2.remap(frame.transpose(1, 2, 0), at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101) for frame in frames]
+        for at in fields
+    ]
+    return np.clip(np.mean(moved, axis=0, dtype=np.float32), -1, 1).transpose(0, 3, 1, 2)
 
 
 def _grey(frames: F32, channels: int) -> F32:

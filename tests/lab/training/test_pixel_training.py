@@ -13,13 +13,14 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.grid_term import grid_term
-from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
+from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, choice_term, pixel_losses
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.reference_blend import Sources, mix
 
 SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
 FRAMES = 3
@@ -216,3 +217,16 @@ def test_it_learns(tmp_path: Path) -> None:
     seen: list[float] = []
     train_per_frame(run_of(24, 20), tmp_path, None, report=lambda step, numbers: seen.append(numbers["picture"]))
     assert sum(seen[-4:]) < 0.7 * sum(seen[:4])
+
+
+def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_where_the_picture_teaches_nothing() -> None:
+    truth = torch.zeros(1, 16, 16, 3)
+    colour = torch.stack([torch.full_like(truth, 0.1), truth], dim=1)  # the render is wrong, the reference right
+    weight = torch.full((1, 1, 16, 16, 1), -12.0, requires_grad=True)
+    sources = Sources(colour, torch.cat([torch.zeros(1, 1, 16, 16, 1), weight], dim=1), torch.ones(1, 2, 16, 16, 1))
+    (by_picture,) = torch.autograd.grad((mix(sources)[0] - truth).abs().mean(), weight, retain_graph=True)
+    (by_choice,) = torch.autograd.grad(choice_term(sources, truth), weight)
+    assert float(by_choice.sum()) < -0.5
+    assert abs(float(by_picture.sum())) < 1e-4
+    nowhere = sources._replace(holds=torch.cat([torch.ones(1, 1, 16, 16, 1), torch.full((1, 1, 16, 16, 1), 1e-6)], dim=1))
+    assert float(choice_term(nowhere, truth).detach()) < 0.1, "a reference that holds nowhere is not to be chosen"

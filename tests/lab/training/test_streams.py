@@ -100,7 +100,7 @@ def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root
 def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
     made = streams(root)
     seen = set()
-    for i in range(0, 48, 4):
+    for i in range(0, 120, 4):
         batch = made.update(i)
         for slot, kind in enumerate(batch.kind.tolist()):
             (episode, at) = made.episode_of(slot, i)
@@ -126,8 +126,12 @@ def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
 
 def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
-    for i in range(0, 24, 4):
+    compared = 0
+    for i in range(0, 120, 4):
         (episode, at), batch = made.episode_of(0, i), made.update(i)
+        if episode.better or episode.moved_px or episode.grey:
+            continue
+        compared += 1
         index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
         cut = np.s_[episode.top : episode.top + 32, episode.left : episode.left + 48]
         for channel, shown in ((episode.sequence.clip.rgb_input, batch.render), (episode.sequence.clip.rgb_gt, batch.target)):
@@ -135,6 +139,19 @@ def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
             wanted = np.stack([episode.levels[raw[..., c], c] for c in range(3)])
             np.testing.assert_array_equal(shown[0, 0].numpy(), wanted)
         assert (np.diff(episode.levels, axis=0) >= 0).all()
+    assert compared > 3
+
+
+def test_a_moved_render_is_the_truth_out_of_place(root: Path) -> None:
+    made = streams(root, shares=StreamShares(1, 0, 0, 0))
+    episodes = [made.episode_of(slot, i)[0] for slot in range(3) for i in range(0, 400, 4)]
+    assert 0.05 < np.mean([episode.moved_px > 0 for episode in episodes]) < 0.3
+    plain = replace(episodes[0], moved_px=0.0, better=0.0, grey=False)
+    for doubled in (False, True):
+        still, moved = (made._show(replace(plain, moved_px=px, doubled=doubled), 0) for px in (1e-6, 2.0))
+        np.testing.assert_allclose(still[0], still[3], atol=1e-3)
+        assert np.abs(moved[0] - moved[3]).mean() > 1e-3
+        np.testing.assert_array_equal(moved[3], made._show(plain, 0)[3])
 
 
 def test_held_out_video_is_never_shown(root: Path) -> None:
@@ -198,3 +215,11 @@ def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_bett
     shown = _lit_references(images, exact)
     assert np.abs(shown[..., :3] - (images[..., :3] / 127.5 - 1)).max() < 1e-5
     assert np.array_equal(_lit_references(images, replace(exact, flip=True)), shown[:, :, :, ::-1])
+
+
+def test_recorded_streets_are_shown_more_often_than_their_number(tmp_path: Path) -> None:
+    for i in range(8):
+        make(tmp_path / "pairs", name=f"street_{i:03d}", frames=6, family="drive" if i == 0 else "street")
+    made = streams(tmp_path, shares=StreamShares(1, 0, 0, 0))
+    shown = [made.episode_of(slot, i)[0].sequence.info["family"] for slot in range(3) for i in range(0, 400, 4)]
+    assert 0.25 < np.mean([family == "drive" for family in shown]) < 0.55

@@ -1,0 +1,143 @@
+"""Adapt a fixer to one recorded street: some updates on its own photographs, kept only where photographs that nobody trained on gain.
+
+Training shows the model where photographs were taken that it was fitted to, with the other photographs as references; the judge is the
+photographs that were held out of the fit. New weights are accepted where the mean gain in PSNR over them is above 0 with 95 % confidence
+(Student's t over photographs), for the alternative is to keep what ships.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.types import F64, Scenario
+from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.io.reading import read_bytes
+from alpasim_plugin.lab.bench.quality import Variant, run_variant
+from alpasim_plugin.lab.bench.quality_run import quality_clip
+from alpasim_plugin.lab.training.drive_pairs import DRIVE, SIDE_PX, Shot, write_drive_sequence
+from alpasim_plugin.lab.training.pair_store import PairSequence
+from alpasim_plugin.lab.training.pixel_rollout import Distance
+from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
+from alpasim_plugin.lab.training.pixel_variants import pixel_variant
+from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
+from alpasim_plugin.lab.training.trainer import Schedule
+from alpasim_plugin.plugins.parts import build, resolve
+
+DOING = "adapting a fixer"
+FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to judge by
+WIDTH_PX = 512  # of the photographs, at most
+LR, WARMUP, CROP = 2e-4, 5, (96, 128)
+VARIANT = "V9-still"
+Report = Callable[[int, Mapping[str, float]], None]
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """What an adaptation gave.
+
+    Attributes:
+        before, after: PSNR of each held-out photograph, dB.
+        gain_db, ci95_db: Mean of the differences, and its interval.
+        accepted: Whether the interval lies above 0, so that the weights were written.
+    """
+
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+    gain_db: float
+    ci95_db: tuple[float, float]
+    accepted: bool
+
+
+def adapt(
+    scenario: Scenario,
+    weights: Path,
+    out: Path,
+    *,
+    updates: int,
+    distance: tuple[str, Distance] | None,
+    seed: int = 0,
+    report: Report | None = None,
+) -> Adapted:
+    """Train on a drive's own photographs and write the weights where held-out photographs gain.
+
+    Args:
+        scenario: An imported drive.
+        weights: Bundle to begin with.
+        out: File for the new bundle; written only where they are accepted.
+        updates: Of the training.
+        distance: Name and function of the perceptual term.
+        seed: Of everything drawn.
+        report: Called after every update with its number and the logged values.
+
+    Raises:
+        InputError: No imported drive, too few photographs, or weights of another kind.
+    """
+    with tempfile.TemporaryDirectory(prefix="simrun-adapt-") as scratch:
+        root = Path(scratch)
+        judge = _pairs(scenario, root, seed)
+        before = _psnr(judge, weights, seed)
+        trained = _trained(root, weights, updates, distance, seed, report)
+        after = _psnr(judge, trained, seed)
+        found = compared(before, after)
+        if found.accepted:
+            write_bytes(out, read_bytes(trained, DOING), DOING)
+    return found
+
+
+def compared(before: F64, after: F64) -> Adapted:
+    """Compare the PSNR of photographs ``(N,)`` before and after, N at least 2."""
+    gain = after - before
+    half = float(stats.t.ppf(0.975, len(gain) - 1) * gain.std(ddof=1) / np.sqrt(len(gain)))
+    mean = float(gain.mean())
+    return Adapted(tuple(before.tolist()), tuple(after.tolist()), mean, (mean - half, mean + half), mean - half > 0)
+
+
+def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
+    """Write the split ``train`` and return the sequence that judges."""
+    camera = next((one.name for one in scenario.cameras), "")
+    taken = sorted((one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us)
+    count = {use: sum(one.use == use for one in taken) for use in ("fitted", "held-out")}
+    if scenario.model is None or count["fitted"] < FEWEST or count["held-out"] < ENOUGH:
+        found = f"{count['fitted']} fitted and {count['held-out']} held-out photographs of camera {camera!r}"
+        do = f"give an imported drive (simrun import drive) with at least {FEWEST} and {ENOUGH} of them"
+        raise InputError(DOING, scenario.scene_id, found, do)
+    width = min(WIDTH_PX, taken[0].width // SIDE_PX * SIDE_PX)
+    shots = [Shot.read(one, width) for one in taken]
+    fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
+    held = [shot for shot in shots if shot.photograph.use == "held-out"]
+    for split, shown in (("train", fitted), ("judge", held)):
+        info: dict[str, Any] = {"scene_id": scenario.scene_id, "seed": seed, "split": split, "family": DRIVE}
+        write_drive_sequence(scenario, shown, fitted, root / "pairs" / split / "drive_0", info, threads=1)
+    return PairSequence(root / "pairs" / "judge" / "drive_0")
+
+
+def _psnr(judge: PairSequence, weights: Path, seed: int) -> F64:
+    """Return the PSNR of each held-out photograph behind the fixer, in order of time, so that it has its history."""
+    name, overrides = bundle_fixer(weights)
+    spec = resolve("fixer", name, overrides)
+    clip = quality_clip(judge)
+    made = run_variant(clip, Variant("adapted", spec), build(spec, scene_id=clip.name, seed=seed, device="cpu", threads=1))
+    return np.array([psnr_db(a, b) for a, b in zip(made.video, clip.truth, strict=True)])
+
+
+def _trained(root: Path, weights: Path, updates: int, distance: tuple[str, Distance] | None, seed: int, report: Report | None) -> Path:
+    name, overrides = bundle_fixer(weights)
+    settings = resolve("fixer", name, overrides).settings
+    if not isinstance(settings, PixelFixerSettings):
+        raise InputError(DOING, str(weights), f"weights of {name}", "give those of onefixer")
+    streams = TrainingStreams(root / "pairs", seed=seed, batch=4, frames=4, crop=CROP, episode=6, shares=StreamShares(0.93, 0.07, 0.0, 0.0))
+    schedule = Schedule(updates, peak_lr=LR, warmup=min(WARMUP, updates), clip=0.5, ema=0.9)
+    return train_per_frame(
+        PixelRun(settings, streams, pixel_variant(VARIANT), schedule, weights, seed), root / "run", distance, report=report
+    )

@@ -1,0 +1,200 @@
+"""Pairs of a recorded street: what a reconstruction of some photographs shows where the others were taken, and those photographs.
+
+Every ``every``-th photograph is held out, in each of the ``every`` ways. A sequence is what was held out of one camera, in order of time;
+the photographs that were fitted are its recording. Render, map and recording are made as behind an imported drive in a closed loop, so the
+damage is that of a real fit: of its poses, its depth, its exposure and its sky.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.types import F32, U8, CameraSpec, Photograph, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.drives.build import POINTS_FILE
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.fit.drive import fit_drive
+from alpasim_plugin.gaussians.fit.photographs import read_points
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
+from alpasim_plugin.lab.training.photograph_pairs import DOING, PhotographPairs, PhotographRecipe
+from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
+from alpasim_plugin.plugins.interfaces import Renderer
+from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.renderers.recorded import photograph_camera, photograph_picture
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
+
+DRIVE = "drive"  # the family of these sequences
+SIDE_PX = 16  # heights are cut at the middle to a multiple of it
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A photograph at the size of the pairs."""
+
+    photograph: Photograph
+    camera: PinholeCamera
+    rgb: U8
+
+    @classmethod
+    def read(cls, one: Photograph, width: int) -> Self:
+        """Read a photograph at a width in pixels, never larger than it is."""
+        whole = photograph_camera(one, width)
+        height = whole.height // SIDE_PX * SIDE_PX
+        top = (whole.height - height) // 2
+        K = whole.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
+        rgb = np.ascontiguousarray(photograph_picture(one, whole)[top : top + height])
+        return cls(one, PinholeCamera(whole.width, height, K, whole.T_camera_world), rgb)
+
+    def spec(self, scenario: Scenario) -> CameraSpec:
+        """Return its camera on the rig."""
+        T_rig_camera = inverse(interpolate(scenario.ego_log, self.photograph.t_us)) @ self.photograph.T_world_camera
+        return CameraSpec(self.photograph.camera, self.camera.width, self.camera.height, self.camera.K, T_rig_camera)
+
+    def view(self, scenario: Scenario, i: int) -> PosedView:
+        """Return it as the ``i``-th view to fit to."""
+        actors = log_actors(scenario, self.photograph.t_us)
+        return PosedView(self.camera, self.rgb, f"{self.photograph.camera}-{i:06d}", actors=actors)
+
+
+def make_drive_pairs(scenario: Scenario, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1) -> Iterator[PhotographPairs]:
+    """Write the sequences ``out/SPLIT/NAME_CAMERA_PHASE``; equal ones are kept.
+
+    Args:
+        scenario: Of an imported drive.
+        name: Of the sequences.
+        out: Folder of pairs.
+        recipe: How.
+        threads: Of the rasteriser.
+
+    Raises:
+        InputError: A camera that took too few photographs.
+    """
+    points = read_points(Path(str(scenario.model)).parent / POINTS_FILE)
+    for camera in sorted({one.camera for one in scenario.recording if one.use != "never-fitted"}):
+        taken = sorted((one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us)
+        if len(taken) < 2 * recipe.every:
+            few = f"{len(taken)} photographs for every {recipe.every}th to be held out"
+            raise InputError(DOING, f"{name}, camera {camera}", few, "give more photographs, or hold out more of them")
+        for phase in range(recipe.every):
+            folder = out / recipe.split / f"{name}_{camera}_{phase}"
+            info = _info(scenario, camera, recipe, phase)
+            made = not is_made(folder, info)
+            if made:
+                shots = [Shot.read(one, recipe.width) for one in taken]
+                _write(scenario, shots, points, folder, recipe, phase, info, threads)
+            yield PhotographPairs(folder, made, PairSequence(folder).info["psnr_db"])
+
+
+def _info(scenario: Scenario, camera: str, recipe: PhotographRecipe, phase: int) -> dict[str, Any]:
+    return {
+        "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": recipe.seed, "split": recipe.split, "family": DRIVE,
+        "actors": len(scenario.actors), "moving_actors": 0, "degradation": {"kind": DRIVE}, "recipe": asdict(recipe),
+        "name_of_camera": camera, "phase": phase,
+    }  # fmt: skip
+
+
+def _write(
+    scenario: Scenario,
+    shots: Sequence[Shot],
+    points: GaussianCloud,
+    folder: Path,
+    recipe: PhotographRecipe,
+    phase: int,
+    info: dict[str, Any],
+    threads: int,
+) -> None:
+    held = [shot for i, shot in enumerate(shots) if i % recipe.every == phase]
+    fitted = [shot for i, shot in enumerate(shots) if i % recipe.every != phase]
+    with tempfile.TemporaryDirectory(prefix="simrun-pairs-") as scratch:
+        known = _fitted(scenario, fitted, points, Path(scratch), recipe, phase, threads)
+        write_drive_sequence(known, held, fitted, folder, info, threads)
+
+
+def write_drive_sequence(
+    scenario: Scenario, shown: Sequence[Shot], recorded: Sequence[Shot], folder: Path, info: dict[str, Any], threads: int
+) -> None:
+    """Write what a drive's model shows where photographs were taken, those photographs, and its recording.
+
+    Args:
+        scenario: With the model.
+        shown: The frames of the sequence, in order of time.
+        recorded: Its recording. A photograph that is in both is never its own reference in training.
+        folder: ROOT/SPLIT/SEQUENCE.
+        info: Of sequence.json.
+        threads: Of the rasteriser.
+    """
+    renderer = make_renderer("3dgs", scenario, seed=int(info["seed"]), threads=threads)
+    geometry: list[FrameGeometry] = []
+    pairs = list(_frames(scenario, shown, renderer, geometry))
+    frames = [_recorded(scenario, shot, renderer) for shot in recorded]
+    lens = shown[0].spec(scenario)
+    facts = {"width": lens.width, "height": lens.height, "K": lens.K.tolist(), "T_rig_camera": lens.T_rig_camera.tolist()}
+    psnr = {"held_out": round(float(np.mean([psnr_db(pair.rgb_input, pair.rgb_gt) for pair in pairs])), 3)}
+    write_sequence(
+        folder, pairs, len(pairs), {**info, "camera": facts, "psnr_db": psnr},
+        lambda partial: write_references(partial, geometry, frames, scenario.actors),
+    )  # fmt: skip
+
+
+def _fitted(
+    scenario: Scenario, shots: Sequence[Shot], points: GaussianCloud, scratch: Path, recipe: PhotographRecipe, phase: int, threads: int
+) -> Scenario:
+    """Return the scenario with a model that was fitted to these photographs alone."""
+    views = [shot.view(scenario, i) for i, shot in enumerate(shots)]
+    splat = replace(SplatRecipe.street(), steps=recipe.steps, hold_out_every=0)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        done = fit_drive(
+            views, points, boxes={actor.actor_id: actor.box for actor in scenario.actors}, scene_id=f"{scenario.scene_id}-{phase}",
+            seed=recipe.seed, threads=threads, recipe=splat,
+        )  # fmt: skip
+    finally:
+        torch.set_num_threads(before)
+    done.model.save(scratch, {"scene_id": scenario.scene_id, "views": len(views)})
+    recording = [
+        replace(shot.photograph, use="fitted", exposure=done.exposures[view.name]) for shot, view in zip(shots, views, strict=True)
+    ]
+    return replace(scenario, model=str(scratch), recording=tuple(recording))
+
+
+def _frames(scenario: Scenario, shots: Sequence[Shot], renderer: Renderer, geometry: list[FrameGeometry]) -> Iterator[Pair]:
+    """Yield the pairs, and append depth and actors of each to ``geometry``."""
+    layers = prepare_map(scenario.lane_map)
+    for shot in shots:
+        spec, T, t_us = shot.spec(scenario), shot.photograph.T_world_camera, shot.photograph.t_us
+        actors = log_actors(scenario, t_us)
+        frame = renderer.render(RenderRequest(t_us, spec, np.stack([T, T]), actors))
+        assert frame.alpha is not None
+        assert frame.depth is not None
+        geometry.append(FrameGeometry(frame.depth.astype(np.float16), actors))
+        opacity = np.rint(frame.alpha * 255).clip(0, 255).astype(np.uint8)
+        sdmap = draw_map(layers, spec, T, actor_boxes(actors, scenario.actors), threads=1)
+        yield Pair(frame.rgb, shot.rgb, opacity, sdmap, T, t_us)
+
+
+def _recorded(scenario: Scenario, shot: Shot, renderer: Renderer) -> RecordedFrame:
+    one = shot.photograph
+    actors = log_actors(scenario, one.t_us)
+
+    def read() -> tuple[U8, F32]:
+        T = one.T_world_camera
+        depth = renderer.render(RenderRequest(one.t_us, shot.spec(scenario), np.stack([T, T]), actors)).depth
+        assert depth is not None
+        return shot.rgb, depth
+
+    return RecordedFrame(one.t_us, one.camera, shot.camera.K, one.T_world_camera, actors, read)

@@ -1,0 +1,45 @@
+"""Pairs of a recorded street: what was held out is never in the recording, and a folder that exists is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.gaussians.files.ply import write_points
+from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
+from alpasim_plugin.lab.training.pair_store import PairSequence
+from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe
+from alpasim_plugin.lab.training.reference_store import open_references
+from tests.renderers.recorded_drive import recorded_drive
+
+
+def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_path: Path) -> None:
+    drive = recorded_drive(tmp_path)
+    xyz = np.random.default_rng(0).uniform((2, -5, 0), (40, 5, 0.1), (400, 3))
+    write_points(tmp_path / "points.ply", xyz, np.full((400, 3), 100, np.uint8))
+    recipe = PhotographRecipe(width=64, every=3, steps=2, split="train")
+    made = list(make_drive_pairs(drive, "street", tmp_path / "pairs", recipe))
+    assert [one.folder.name for one in made] == ["street_front_0", "street_front_1", "street_front_2"]
+    taken = {one.t_us for one in drive.recording if one.camera == "front"}
+    shown: list[int] = []
+    for one in made:
+        sequence = PairSequence(one.folder)
+        references = open_references(sequence)
+        assert references is not None
+        assert sequence.size == (64, 48)
+        held, recorded = set(sequence.clip.t_us.tolist()), set(references.rgb_t_us.tolist())
+        assert not held & recorded
+        assert held | recorded == taken
+        assert (references.depth[0, 40:] > 0).any()
+        shown += sorted(held)
+    assert sorted(shown) == sorted(taken)
+    assert not any(one.made for one in make_drive_pairs(drive, "street", tmp_path / "pairs", recipe))
+
+
+def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
+    write_points(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    with pytest.raises(InputError, match="9 photographs for every 5th"):
+        list(make_drive_pairs(recorded_drive(tmp_path), "street", tmp_path / "pairs", PhotographRecipe(width=64, every=5)))
