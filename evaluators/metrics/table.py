@@ -252,8 +252,8 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
     "lateral_distance_m": _metres(
         "mean distance to the side of the recorded path, which goes straight on beyond its ends", "lower", "mean", is_headline=True,
         label="lateral distance", margin=0.1, reference=CENTRE, invalid=_SHORT,
-        formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within 0.5 m "
-        "of an end is standing): driving past the end is no distance",
+        formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within "
+        "0.5 m of an end is standing): driving past the end is no distance",
     ),
     "route_distance_m": _metres(
         "the paper's: mean distance from the recorded path; driving past its end counts as distance", "lower", "mean",
