@@ -18,7 +18,9 @@ from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
+    DASH,
     LEAST_SPAN,
+    NARROW,
     Cell,
     count_of,
     decimals,
@@ -40,8 +42,6 @@ class Span:
     centre: float
     low: float | None = None
     high: float | None = None
-    inner_low: float | None = None
-    inner_high: float | None = None
     zero: float | None = None
 
 
@@ -96,7 +96,7 @@ def metric_rows(
         facts = known.shown(name)
         percent = facts.in_percent
         reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
-        halves = [h for e in entries if (h := finite(e.get("ci95")))]
+        halves = [(ends[1] - ends[0]) / 2 for e in entries if (ends := interval(e.get("ci95_clustered")))]
         means = [m for e in entries if (m := finite(e.get("mean")))]
         places = 1 if percent else max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
         cells = tuple(metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True))
@@ -118,43 +118,38 @@ def metric_rows(
 
 
 def metric_cell(metric: MetricInfo, entry: Mapping[str, Any], places: int, reason: str = "") -> Cell:
-    """Print a mean with both intervals and, for rates, its count."""
+    """Print a mean with its interval, scenes as clusters, and for rates the count."""
     mean = finite(entry.get("mean"))
     n_rollouts, n_scenes = int(entry.get("n_rollouts") or 0), int(entry.get("n_scenes") or 0)
     if mean is None:
         stated = reason or str(entry.get("reason") or "")
         return missing(stated or ("valid in no rollout" if entry else "not computed for this renderer"))
     scale = 100.0 if metric.in_percent else 1.0
-    half = finite(entry.get("ci95"))
     clustered = interval(entry.get("ci95_clustered"))
-    detail = "\u00b1\u00a0" + (fixed(half * scale, places) if half is not None else "\u2014")
-    if clustered is None:
-        detail += " \u00b7 \u2014"
-    else:
-        low, high = (fixed(v * scale, places) for v in clustered)
-        detail += f" \u00b7 {low} to {high}"
     notes = [f"{plural(n_rollouts, 'rollout')}, {plural(n_scenes, 'scene')}"]
     if entry.get("n_invalid"):
         notes.append(f"invalid in {entry['n_invalid']} more" + (f" ({reason})" if reason else ""))
-    if half is None:
-        notes.append(f"no \u00b1: {entry.get('ci95_reason') or 'it needs at least two rollouts'}")
     if clustered is None:
         notes.append(f"no interval over scenes: {entry.get('ci95_clustered_reason') or 'it needs at least two scenes'}")
     if entry.get("note"):
         notes.append(str(entry["note"]))
-    count = count_of(mean, n_rollouts) if metric.is_flag else ""
-    return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
+    counted = count_of(mean, n_rollouts) if metric.is_flag else ""
+    detail = DASH if clustered is None else " to ".join(fixed(v * scale, places) for v in clustered)
+    if counted:
+        detail = f"{counted.replace(' of ', '/')} ({detail}{'' if clustered is None else NARROW + '%'})"
+        if mean == 0.0 and clustered is not None:
+            notes.append(f"no event in {n_rollouts}: only rates above {fixed(clustered[1] * scale, places)} % are excluded")
+    return Cell(fixed(mean * scale, places), "; ".join(notes), detail, mean)
 
 
 def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str) -> tuple[tuple[Span | None, ...], str]:
-    """Place means and both intervals of one metric on one axis that includes zero."""
+    """Place means and intervals of one metric on one axis that includes zero."""
     values: list[float] = [0.0]
     for e in entries:
         mean = finite(e.get("mean"))
         if mean is not None:
             values.append(mean)
-            for bounds in (interval(e.get("ci95"), mean), interval(e.get("ci95_clustered"))):
-                values += bounds or ()
+            values += interval(e.get("ci95_clustered")) or ()
     low, high = min(values), max(values)
     if rate:
         low, high = max(low, 0.0), min(max(high, 0.02), 1.0)
@@ -171,14 +166,12 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
         if mean is None:
             spans.append(None)
             continue
-        outer, inner = interval(e.get("ci95_clustered")), interval(e.get("ci95"), mean)
+        outer = interval(e.get("ci95_clustered"))
         spans.append(
             Span(
                 place(mean),
                 place(outer[0]) if outer else None,
                 place(outer[1]) if outer else None,
-                place(inner[0]) if inner else None,
-                place(inner[1]) if inner else None,
                 place(0.0) if low < 0.0 else None,
             )
         )
