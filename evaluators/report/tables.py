@@ -14,7 +14,7 @@ from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run
 from evaluators.report.flips import colours_of
-from evaluators.report.headline import more_scenes_text, tone_of
+from evaluators.report.headline import families_text, more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
@@ -42,6 +42,8 @@ class Span:
     centre: float
     low: float | None = None
     high: float | None = None
+    family_low: float | None = None  # with families of scenes as the unit
+    family_high: float | None = None
     zero: float | None = None
 
 
@@ -172,7 +174,7 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
                 place(mean),
                 place(outer[0]) if outer else None,
                 place(outer[1]) if outer else None,
-                place(0.0) if low < 0.0 else None,
+                zero=place(0.0) if low < 0.0 else None,
             )
         )
     places = 0 if scale == 100.0 and high >= 0.1 else decimals(low * scale, high * scale, digits=2)
@@ -200,7 +202,7 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
     reason = str(entry.get("reason") or "")
     diff_cell = missing(reason or "no pair has this metric valid on both sides")
     bounds_cell = missing(reason or "it needs at least two scenes")
-    span = None
+    span, families_said = None, ""
     if diff is not None:
         ends = bounds or ()
         places = 1 if scale == 100.0 else decimals(*(v * scale for v in (diff, *ends)), digits=3)
@@ -208,9 +210,11 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
         if bounds is not None:
             low, high = (fixed(v * scale, places, sign=True) for v in bounds)
             bounds_cell = Cell(f"{low} to {high}", note, sort=bounds[1] - bounds[0])
-            reach = max(abs(bounds[0]), abs(bounds[1]), abs(diff)) or 1.0
-            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds)]
-            span = Span(at[0], at[1], at[2], zero=50.0)
+            families_said = families_text(entry, scale, places, unit).removeprefix("; ")
+            families = interval((entry.get("families") or {}).get("ci95")) or ()
+            reach = max(map(abs, (diff, *bounds, *families))) or 1.0
+            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *families)]
+            span = Span(at[0], at[1], at[2], *at[3:], zero=50.0)
     p = finite(entry.get("p_value"))
     p_cell = missing(reason or "no test was made") if p is None else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
@@ -222,7 +226,10 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
     }.get((verdict, str(entry.get("difference"))), verdict)
     margin, more = finite(entry.get("margin")), more_scenes_text(entry.get("more_scenes"))
     said = [f"margin {short(margin * scale, unit)}"] if margin is not None and entry.get("direction") != "none" else []
-    base, hint = str(entry.get("baseline") or "\u2014"), "; ".join([*said, *([more] if more else [])])
+    base, hint = (
+        str(entry.get("baseline") or "\u2014"),
+        "; ".join([*said, *([more] if more else []), *([families_said] if families_said else [])]),
+    )
     return PairRow(variant, base, metric.name, metric.help, diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
 
 
