@@ -37,6 +37,7 @@ from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
 from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
+from evaluators.statistics.families import grouped
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
@@ -170,7 +171,8 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
     write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
     baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
-    summary = write_summary(root, manifests, info["preset"], baseline, more, bases, MetricTable.of_run(info))
+    paths = {scene: str((facts.get("ref") or {}).get("path") or scene) for scene, facts in (info.get("scenes") or {}).items()}
+    summary = write_summary(root, manifests, info["preset"], baseline, more, bases, MetricTable.of_run(info), grouped(paths))
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary

@@ -19,6 +19,7 @@ from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import DIRECTION_M, followed, on_route, recorded_path, to_path
 from evaluators.metrics.score import handover_us, series, with_preset
+from evaluators.metrics.table import METRICS
 
 if TYPE_CHECKING:
     from alpasim_plugin.run_folder.rows import Rollout
@@ -83,8 +84,8 @@ def in_words(had: Iterable[str]) -> str:
 
 
 def event_words(metric: str) -> str:
-    """Name an event of a manifest: an outcome, or the side of a contact as the collision that it is."""
-    return OUTCOMES[metric].words if metric in OUTCOMES else OUTCOMES["collision_any"].words
+    """Name an event of a manifest: an outcome, another metric with a label, or the side of a contact as the collision that it is."""
+    return OUTCOMES[metric].words if metric in OUTCOMES else METRICS.shown(metric).label or OUTCOMES["collision_any"].words
 
 
 def has_ended(rollout: Rollout) -> bool:

@@ -181,6 +181,7 @@ FOOTPRINT, CENTRE = "footprint, plan view", "box centre, plan view"
 UNKNOWN = MetricInfo("", "none", "last", "")
 _SIGNED = (None, None)
 _NOT_LOOKED_FOR = "nothing is touched in a recorded drive whose standing obstacles were not looked for"
+_FEW = "three steps or fewer"
 _NO_LANES, _NO_CONTACT, _SHORT = "no lanes", "steps without contact", "`P` is shorter than 1 m"
 _UNCOVERED, _NO_IMAGE, _EITHER = "the recording does not cover `t`", "no image", "unknown unless one fired"
 _BEGAN = "where on `F` the contact that touches now began; `strict` only"
@@ -252,8 +253,8 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
     "lateral_distance_m": _metres(
         "mean distance to the side of the recorded path, which goes straight on beyond its ends", "lower", "mean", is_headline=True,
         label="lateral distance", margin=0.1, reference=CENTRE, invalid=_SHORT,
-        formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within 0.5 m "
-        "of an end is standing): driving past the end is no distance",
+        formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within "
+        "0.5 m of an end is standing): driving past the end is no distance",
     ),
     "route_distance_m": _metres(
         "the paper's: mean distance from the recorded path; driving past its end counts as distance", "lower", "mean",
@@ -284,6 +285,33 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
         "the ego drives at less than half the speed of the recording there, which it had before, although nothing is in its way",
         label="rollouts that braked without a cause", reference=CENTRE, invalid=_SHORT,
         formula="[stalled and braked without a cause](outcomes.md#stalled)",
+    ),
+    "hard_brake": _flag(
+        "the ego brakes harder than 4.05 m/s2", label="hard brake", reference="rear axle",
+        formula="deceleration along the vehicle, smoothed over 0.8 s, above 4.05 m/s2 (nuPlan's bound)", invalid=_FEW,
+    ),
+    "uncomfortable": _flag(
+        "an acceleration, a jerk or the turning is beyond nuPlan's bounds of comfort", reference="rear axle", invalid=_FEW,
+        formula="outside one of: acceleration -4.05 to 2.40 along and 4.89 m/s2 across, jerk 4.13 along and 8.37 m/s3 in all, yaw 0.95 "
+        "rad/s and 1.93 rad/s2",
+    ),
+    "time_to_collision_s": MetricInfo(
+        "s", "higher", "min", "time until the ego touches somebody ahead if all go on as they are; at most 3 s", limits=(0.0, 3.0),
+        reference=FOOTPRINT,
+        formula="least of 0.1, 0.2, ... s after which `F` and a rectangle ahead, both going straight on, touch; 3 if none",
+    ),
+    "rss_margin_m": _metres(
+        "gap to who is ahead, less the distance that responsibility-sensitive safety asks for", "higher", "min", limits=_SIGNED,
+        reference=FOOTPRINT, invalid="steps with nobody ahead",
+        formula="gap in the strip straight ahead minus v + 1.75 + (v + 3.5)^2 / 8 - u^2 / 16 (at least 0), v and u the speeds of both",
+    ),
+    "impact_speed_mps": MetricInfo(
+        "m/s", "lower", "max", "relative speed at the first contact with a road user", limits=(0.0, None), reference=FOOTPRINT,
+        formula="size of the difference of both velocities at the first step of a contact", invalid=_NO_CONTACT,
+    ),
+    "wrong_way": _flag(
+        "the ego has driven 2 m against its lanes within the last second", label="wrong way", reference=CENTRE, invalid=_NO_LANES,
+        formula="metres against the best agreeing lane under `c` within 1 s are 2 or more",
     ),
     "dist_to_gt_location": _metres(
         "distance of the ego centre from where the recording is at that time", "lower", "max", margin=0.5, reference=CENTRE,

@@ -29,7 +29,7 @@ LEDGER_NOTE = "Rates: least and greatest, had every missing rollout and every cu
 MAX_WITH_VALUES = 2000  # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "policy": "error", "infrastructure": "error", "evaluator": "error"}
-INTERVAL_NOTE = "\u00b1 is 1.96 \u03c3/\u221aN over rollouts; a to b is the 95 % interval with scenes as clusters."
+INTERVAL_NOTE = "a to b is the 95 % interval with scenes as clusters."
 
 
 def write_summary_md(run_dir: Path | str) -> Path:
@@ -118,10 +118,10 @@ def metric_label(name: str, unit: str, arrow: str) -> str:
 
 
 def cell_text(cell: Cell) -> str:
-    """Print a mean with its count and intervals, or why there is none."""
+    """Print a mean with its count and interval, or why there is none."""
     if cell.missing:
         return f"{cell.text} ({cell.note})" if cell.note else cell.text
-    return f"{cell.text}{f' ({cell.count})' if cell.count else ''}, {cell.detail}" if cell.detail else cell.text
+    return f"{cell.text}, {cell.detail}" if cell.detail else cell.text
 
 
 def write_junit(run_dir: Path | str) -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-DASH = "\u2014"
+DASH, NARROW = "\u2014", "\u202f"
 LEAST_SPAN = {"m": 0.1, "points": 1.0, "s": 0.1}  # of an axis, by unit: less than this is not worth a picture
 ARROWS = {"lower": "\u2193", "higher": "\u2191"}
 ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
@@ -20,8 +20,7 @@ class Cell:
     Attributes:
         text: What is printed; an em dash where the number is missing.
         note: Shown on hover: the reason of a missing number, or counts behind a present one.
-        detail: Second, smaller line (intervals); may be empty.
-        count: "7 of 300" for rates, else empty.
+        detail: Second, smaller line: the interval, for rates behind the count, "7/300 (1.0 to 5.0 %)"; may be empty.
         sort: Key for sorting; None sorts last.
         tone: "worse", "better" or "" (nothing to say).
     """
@@ -29,7 +28,6 @@ class Cell:
     text: str
     note: str = ""
     detail: str = ""
-    count: str = ""
     sort: float | None = None
     tone: str = ""
 

@@ -15,11 +15,13 @@ from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run
 from evaluators.report.flips import colours_of
-from evaluators.report.headline import more_scenes_text, tone_of
+from evaluators.report.headline import families_text, more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
+    DASH,
     LEAST_SPAN,
+    NARROW,
     Cell,
     count_of,
     decimals,
@@ -41,8 +43,8 @@ class Span:
     centre: float
     low: float | None = None
     high: float | None = None
-    inner_low: float | None = None
-    inner_high: float | None = None
+    family_low: float | None = None  # with families of scenes as the unit
+    family_high: float | None = None
     zero: float | None = None
 
 
@@ -97,7 +99,7 @@ def metric_rows(
         facts = known.shown(name)
         percent = facts.in_percent
         reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
-        halves = [h for e in entries if (h := finite(e.get("ci95")))]
+        halves = [(ends[1] - ends[0]) / 2 for e in entries if (ends := interval(e.get("ci95_clustered")))]
         means = [m for e in entries if (m := finite(e.get("mean")))]
         places = 1 if percent else max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
         cells = tuple(metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True))
@@ -119,43 +121,38 @@ def metric_rows(
 
 
 def metric_cell(metric: MetricInfo, entry: Mapping[str, Any], places: int, reason: str = "") -> Cell:
-    """Print a mean with both intervals and, for rates, its count."""
+    """Print a mean with its interval, scenes as clusters, and for rates the count."""
     mean = finite(entry.get("mean"))
     n_rollouts, n_scenes = int(entry.get("n_rollouts") or 0), int(entry.get("n_scenes") or 0)
     if mean is None:
         stated = reason or str(entry.get("reason") or "")
         return missing(stated or ("valid in no rollout" if entry else "not computed for this renderer"))
     scale = 100.0 if metric.in_percent else 1.0
-    half = finite(entry.get("ci95"))
     clustered = interval(entry.get("ci95_clustered"))
-    detail = "\u00b1\u00a0" + (fixed(half * scale, places) if half is not None else "\u2014")
-    if clustered is None:
-        detail += " \u00b7 \u2014"
-    else:
-        low, high = (fixed(v * scale, places) for v in clustered)
-        detail += f" \u00b7 {low} to {high}"
     notes = [f"{plural(n_rollouts, 'rollout')}, {plural(n_scenes, 'scene')}"]
     if entry.get("n_invalid"):
         notes.append(f"invalid in {entry['n_invalid']} more" + (f" ({reason})" if reason else ""))
-    if half is None:
-        notes.append(f"no \u00b1: {entry.get('ci95_reason') or 'it needs at least two rollouts'}")
     if clustered is None:
         notes.append(f"no interval over scenes: {entry.get('ci95_clustered_reason') or 'it needs at least two scenes'}")
     if entry.get("note"):
         notes.append(str(entry["note"]))
-    count = count_of(mean, n_rollouts) if metric.is_flag else ""
-    return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
+    counted = count_of(mean, n_rollouts) if metric.is_flag else ""
+    detail = DASH if clustered is None else " to ".join(fixed(v * scale, places) for v in clustered)
+    if counted:
+        detail = f"{counted.replace(' of ', '/')} ({detail}{'' if clustered is None else NARROW + '%'})"
+        if mean == 0.0 and clustered is not None:
+            notes.append(f"no event in {n_rollouts}: only rates above {fixed(clustered[1] * scale, places)} % are excluded")
+    return Cell(fixed(mean * scale, places), "; ".join(notes), detail, mean)
 
 
 def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str) -> tuple[tuple[Span | None, ...], str]:
-    """Place means and both intervals of one metric on one axis that includes zero."""
+    """Place means and intervals of one metric on one axis that includes zero."""
     values: list[float] = [0.0]
     for e in entries:
         mean = finite(e.get("mean"))
         if mean is not None:
             values.append(mean)
-            for bounds in (interval(e.get("ci95"), mean), interval(e.get("ci95_clustered"))):
-                values += bounds or ()
+            values += interval(e.get("ci95_clustered")) or ()
     low, high = min(values), max(values)
     if rate:
         low, high = max(low, 0.0), min(max(high, 0.02), 1.0)
@@ -172,15 +169,13 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
         if mean is None:
             spans.append(None)
             continue
-        outer, inner = interval(e.get("ci95_clustered")), interval(e.get("ci95"), mean)
+        outer = interval(e.get("ci95_clustered"))
         spans.append(
             Span(
                 place(mean),
                 place(outer[0]) if outer else None,
                 place(outer[1]) if outer else None,
-                place(inner[0]) if inner else None,
-                place(inner[1]) if inner else None,
-                place(0.0) if low < 0.0 else None,
+                zero=place(0.0) if low < 0.0 else None,
             )
         )
     places = 0 if scale == 100.0 and high >= 0.1 else decimals(low * scale, high * scale, digits=2)
@@ -208,7 +203,7 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
     reason = str(entry.get("reason") or "")
     diff_cell = missing(reason or "no pair has this metric valid on both sides")
     bounds_cell = missing(reason or "it needs at least two scenes")
-    span = None
+    span, families_said = None, ""
     if diff is not None:
         ends = bounds or ()
         places = 1 if scale == 100.0 else decimals(*(v * scale for v in (diff, *ends)), digits=3)
@@ -216,9 +211,11 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
         if bounds is not None:
             low, high = (fixed(v * scale, places, sign=True) for v in bounds)
             bounds_cell = Cell(f"{low} to {high}", note, sort=bounds[1] - bounds[0])
-            reach = max(abs(bounds[0]), abs(bounds[1]), abs(diff)) or 1.0
-            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds)]
-            span = Span(at[0], at[1], at[2], zero=50.0)
+            families_said = families_text(entry, scale, places, unit).removeprefix("; ")
+            families = interval((entry.get("families") or {}).get("ci95")) or ()
+            reach = max(map(abs, (diff, *bounds, *families))) or 1.0
+            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *families)]
+            span = Span(at[0], at[1], at[2], *at[3:], zero=50.0)
     p = finite(entry.get("p_value"))
     p_cell = missing(reason or "no test was made") if p is None else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
@@ -230,7 +227,10 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
     }.get((verdict, str(entry.get("difference"))), verdict)
     margin, more = finite(entry.get("margin")), more_scenes_text(entry.get("more_scenes"))
     said = [f"margin {short(margin * scale, unit)}"] if margin is not None and entry.get("direction") != "none" else []
-    base, hint = str(entry.get("baseline") or "\u2014"), "; ".join([*said, *([more] if more else [])])
+    base, hint = (
+        str(entry.get("baseline") or "\u2014"),
+        "; ".join([*said, *([more] if more else []), *([families_said] if families_said else [])]),
+    )
     return PairRow(variant, base, metric.name, metric.help, diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
 
 

@@ -22,7 +22,7 @@ from evaluators.report.tables import metric_rows
 from evaluators.scores.table import SCORES
 from evaluators.statistics.arms import Arm
 
-MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 %, scenes as clusters"
+MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
 GAP_NOTE = "; \u2014: one rollout or one scene is too few, or no valid value (report.html says which)"
 
 
@@ -57,7 +57,7 @@ def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent:
 
 
 def render_table(summary: Mapping[str, Any], headline_only: bool = False, known: MetricTable = METRICS) -> Table:
-    """Lay out metrics x renderers with mean and both 95 % intervals.
+    """Lay out metrics x renderers with mean and 95 % interval.
 
     Args:
         summary: Content of ``summary.json``.
@@ -90,10 +90,7 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False, known:
 def _cell(cell: Cell) -> Text:
     if cell.missing:
         return Text(cell.text, style="dim")
-    half, _, bounds = cell.detail.partition(" \u00b7 ")
-    lines = [half.replace("\u00a0", ""), bounds, cell.count]
-    text = Text(cell.text, style="bold").append(f" {lines[0]}", style="not bold dim")
-    return text.append("".join(f"\n{line}" for line in lines[1:] if line), style="not bold dim")
+    return Text(cell.text, style="bold").append(f"\n{cell.detail}" if cell.detail else "", style="not bold dim")
 
 
 LABEL = 9  # width of the labels

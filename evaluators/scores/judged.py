@@ -23,10 +23,11 @@ class Judged:
     """One trajectory of the ego's box centre, driven or planned, among the road users of a log."""
 
     def __init__(self, rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> None:
-        self.ego, self.tracks = states_of(rollout, preset, centre)
+        origin = origin_of(scene.ego_log, preset)
+        self.ego, self.tracks = states_of(rollout, preset, centre, origin)
         self._lanes = list(scene.lane_map.lanes.values())
-        self._xyz = centre.xyz - origin_of(rollout.ego_log, preset)
-        self._road = road_of(scene.lane_map, origin_of(scene.ego_log, preset), preset) if self._lanes else None
+        self._xyz = centre.xyz - origin
+        self._road = road_of(scene.lane_map, origin, preset) if self._lanes else None
         self._looked_for = scene.standing != "unknown"
 
     @property

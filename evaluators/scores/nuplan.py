@@ -131,19 +131,39 @@ def time_to_collision(
     near = angle < AHEAD_RAD
     if beside is not None:
         near |= beside[step] & (angle <= BEHIND_RAD)
-    way_m = horizon_s * (ego.speed[step] + tracks.speed[actor, step]) + np.hypot(*ego.size) / 2 + np.hypot(*tracks.size[actor].T) / 2
-    near &= np.hypot(*(tracks.xy[actor, step] - ego.centre[step]).T) <= way_m
     actor, step = actor[near], step[near]
-    ego_speed = ego.speed[step][:, None] * ego.heading[step]
-    for after_s in np.arange(step_s, horizon_s, step_s).tolist():
-        open_ = np.flatnonzero(np.isinf(out[step]))
-        own = ego.boxes(ego.centre[step[open_]] + after_s * ego_speed[open_], ego.yaw[step[open_]]).shapes()
-        hit = shapely.intersects(own, tracks.boxes(actor[open_], step[open_], after_s).shapes())
-        out[step[open_[hit]]] = after_s
+    first_s, last_s = touching_s(ego, tracks, actor, step)
+    after_s = step_s * np.maximum(np.ceil(first_s / step_s - 1e-9), 1.0)
+    hit = (after_s <= last_s) & (after_s < horizon_s - 1e-9)
+    np.minimum.at(out, step[hit], after_s[hit])
     for one in found:
         if one.at_fault and ego.speed[one.step] > STANDS_MPS:
             out[one.step] = 0.0
     return out
+
+
+@np.errstate(divide="ignore", invalid="ignore")  # boxes that do not move along an axis overlap on it always or never
+def touching_s(ego: EgoStates, tracks: Tracks, actor: I64, step: I64) -> tuple[F64, F64]:
+    """Return from when to when ``(M,)`` boxes of pairs touch if both go straight on; the first is later than the last where they never do.
+
+    The ego moves at its speed along its heading. Two boxes touch while they overlap on each of their four axes.
+    """
+    apart, yaws = tracks.xy[actor, step] - ego.centre[step], (ego.yaw[step], tracks.yaw[actor, step])
+    gone = tracks.velocity[actor, step] - ego.speed[step][:, None] * ego.heading[step]
+    sizes = np.broadcast_to(np.array(ego.size), (len(step), 2)), tracks.size[actor]
+    first_s, last_s = np.full(len(step), -np.inf), np.full(len(step), np.inf)
+    for yaw in (yaws[0], yaws[0] + np.pi / 2, yaws[1], yaws[1] + np.pi / 2):
+        axis = np.cos(yaw), np.sin(yaw)
+        reach = sum(
+            np.abs(size[:, 0] * np.cos(yaw - own) / 2) + np.abs(size[:, 1] * np.sin(yaw - own) / 2)
+            for own, size in zip(yaws, sizes, strict=True)
+        )
+        at, rate = (axis[0] * one[:, 0] + axis[1] * one[:, 1] for one in (apart, gone))
+        ends = np.sort([(-reach - at) / rate, (reach - at) / rate], axis=0)
+        still = rate == 0.0
+        ends[:, still] = np.where(np.abs(at) <= reach, [[-np.inf], [np.inf]], [[np.inf], [-np.inf]])[:, still]
+        first_s, last_s = np.maximum(first_s, ends[0]), np.minimum(last_s, ends[1])
+    return first_s, last_s
 
 
 def motion(ego: EgoStates) -> dict[str, F64]:

@@ -126,7 +126,7 @@ def _hugsim(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajector
 def _ncap(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> Mapping[str, Part]:
     """Compare the speed of the impact with that of a drive that goes on as it was at the handover."""
     impact = _impact_mps(rollout, preset, centre)
-    first = states_of(rollout, preset, rollout.ego)[0]
+    first = states_of(rollout, preset, rollout.ego, origin_of(rollout.ego, preset))[0]
     k = int(np.searchsorted(rollout.ego.t_us, centre.t_us[0]))
     after_s = (centre.t_us - centre.t_us[0]) * 1e-6
     v = first.velocity[k, 0] * first.heading[k]
@@ -146,7 +146,7 @@ def _impact_mps(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> floa
     found = contact_events(replace(rollout, ego=centre, render_start_us=int(centre.t_us[0]), force_gt_us=0), preset)
     if not found:
         return None
-    ego, tracks = states_of(rollout, preset, centre)
+    ego, tracks = states_of(rollout, preset, centre, origin_of(rollout.ego, preset))
     k = max(int(np.searchsorted(ego.t_us - ego.t_us[0], round(found[0].t_s * 1e6))) - 1, 0)  # before it, when nothing is shoved yet
     a = tracks.ids.index(found[0].actor_id)
     k = k if tracks.there[a, k] else int(np.argmax(tracks.there[a]))

@@ -15,7 +15,7 @@ import scipy
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
-from evaluators.metrics.footprint import ActorTable, Footprints, origin_of
+from evaluators.metrics.footprint import ActorTable, Footprints
 from evaluators.metrics.presets import Preset
 
 Kind = Literal["vru", "vehicle", "object"]
@@ -100,12 +100,12 @@ class Tracks:
         return Footprints(self.xy[actor, step] + after_s * self.velocity[actor, step], self.yaw[actor, step], self.size[actor])
 
 
-def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> tuple[EgoStates, Tracks]:
+def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory, origin: F64) -> tuple[EgoStates, Tracks]:
     """Return the states of a trajectory of the ego's box centre, driven or planned, and the others as the log has them at its times.
 
-    Positions are relative to `evaluators.metrics.footprint.origin_of` the recorded drive.
+    Positions are relative to an origin ``(3,)``.
     """
-    origin, t_us = origin_of(rollout.ego_log, preset), centre.t_us
+    t_us = centre.t_us
     rear = offset_trajectory(centre, inverse(rollout.T_rig_box))
     yaw, rear_xy = np.unwrap(yaw_from_quat(centre.quat)), rear.xyz[:, :2] - origin[:2]
     velocity = in_axes(_rate(rear_xy, t_us), yaw)

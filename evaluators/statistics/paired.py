@@ -135,7 +135,7 @@ def compare(
         ``reason`` where numbers are None, ``note`` where they need care.
     """
     margin = metric.accepted if margin is None else margin
-    pairs = _Pairs(here, there, metric.name)
+    pairs = Pairs(here, there, metric.name)
     entry: dict[str, Any] = {
         "baseline": baseline,
         "diff": None,
@@ -254,7 +254,7 @@ def reach_of(metric: MetricInfo, margin: float) -> float:
     return float(most) if np.isfinite(most) else REACH * (metric.accepted or margin)
 
 
-class _Pairs:
+class Pairs:
     """Cells with a value on both sides, and those without."""
 
     def __init__(self, here: Side, there: Side, metric: str) -> None:

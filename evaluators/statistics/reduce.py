@@ -19,7 +19,8 @@ from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
 
 EVENTS = (
-    "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane", "left_route", "stalled", "braked_without_cause"
+    "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane", "left_route", "stalled", "braked_without_cause",
+    "hard_brake", "wrong_way",
 )  # fmt: skip
 
 NEVER_ENGAGED = "the policy never took over: every step belongs to the warm-up"

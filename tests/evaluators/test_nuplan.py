@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from evaluators.scores import nuplan
 from evaluators.scores.states import EgoStates, Tracks
@@ -79,3 +80,24 @@ def test_the_devkits_own_test_vectors_give_its_numbers_to_all_printed_digits(pat
     if name in SERIES:
         values = nuplan.motion(states([scene["ego"], *scene["ego_future_states"]]))[SERIES[name]]
         assert np.round(values, 2).tolist() == expected["time_series"]["values"]
+
+
+def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
+    rng = np.random.default_rng(5)
+    n = 200
+    ego = EgoStates(
+        np.arange(n) * 100_000, rng.uniform(-9, 9, (n, 2)), rng.uniform(-4, 4, n), np.column_stack([rng.uniform(0, 12, n), np.zeros(n)]),
+        np.zeros((n, 2)), (5.0, 2.0), 1.4,
+    )  # fmt: skip
+    shape = (1, n)
+    velocity = rng.uniform(-9, 9, (*shape, 2)) * (rng.random((*shape, 1)) < 0.7)  # some stand
+    others = Tracks(
+        ("a",), ("vehicle",), np.ones(shape, bool), rng.uniform(-20, 20, (*shape, 2)), rng.uniform(-4, 4, shape),
+        np.array([[4.0, 1.8]]), velocity,
+    )  # fmt: skip
+    everyone, steps = np.zeros(n, dtype=np.int64), np.arange(n)
+    first_s, last_s = nuplan.touching_s(ego, others, everyone, steps)
+    for after_s in np.arange(0.0, 4.0, 0.05):
+        own = ego.boxes(ego.centre + after_s * ego.speed[:, None] * ego.heading, ego.yaw).shapes()
+        hit = shapely.intersects(own, others.boxes(everyone, steps, after_s).shapes())
+        assert hit.tolist() == ((first_s <= after_s) & (after_s <= last_s)).tolist()

@@ -89,7 +89,7 @@ def test_every_declared_metric_has_one_line_of_help():
     for name, facts in METRICS.items():
         assert facts.help, name
         assert "\n" not in facts.help
-        assert facts.is_flag or facts.direction == "none" or facts.unit in ("m", "", "dB", "ms")
+        assert facts.is_flag or facts.direction == "none" or facts.unit in ("m", "", "dB", "ms", "s", "m/s")
 
 
 def test_scoring_twice_gives_the_same_bytes():

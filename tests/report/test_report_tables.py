@@ -21,12 +21,11 @@ def entry(mean: float | None, **more: Any) -> dict[str, Any]:
     return base | {"unit": "", "direction": "lower"} | more
 
 
-def test_rate_is_percent_with_counts_and_both_intervals() -> None:
+def test_rate_is_percent_with_its_count_and_one_interval() -> None:
     (row,) = metric_rows({"metrics": {"3dgs": {"offroad": entry(7 / 300)}}})
     (cell,) = row.cells
     assert (cell.text, row.unit, row.arrow) == ("2.3", "%", "\u2193")
-    assert cell.count == "7 of 300"
-    assert cell.detail == "\u00b1\u00a01.9 \u00b7 1.0 to 5.0"
+    assert cell.detail == "7/300 (1.0 to 5.0\u202f%)"
     assert "300\u00a0rollouts, 60\u00a0scenes" in cell.note
 
 
@@ -48,8 +47,7 @@ def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
     one = entry(0.4, unit="m", ci95=None, ci95_clustered=None, n_rollouts=1, n_scenes=1, ci95_reason="one rollout has no spread")
     (row,) = metric_rows({"metrics": {"a": {"lateral_distance_m": one}}})
     assert row.cells[0].text == "0.400"
-    assert row.cells[0].detail == "\u00b1\u00a0\u2014 \u00b7 \u2014"
-    assert "no \u00b1: one rollout has no spread" in row.cells[0].note
+    assert row.cells[0].detail == DASH
     assert "no interval over scenes" in row.cells[0].note
 
 
@@ -57,7 +55,13 @@ def test_metric_of_a_third_party_is_shown_without_help() -> None:
     (row,) = metric_rows({"metrics": {"a": {"my_metric": entry(3.25, unit="jerk", direction="none")}}})
     assert (row.name, row.unit, row.arrow, row.meaning) == ("my_metric", "jerk", "", "")
     assert row.cells[0].text == "3.250"
-    assert not row.cells[0].count
+
+
+def test_no_event_says_which_rates_are_excluded_and_which_not() -> None:
+    none = entry(0.0, ci95=0.0, ci95_clustered=[0.0, 0.7076], n_rollouts=3, n_scenes=3)
+    (row,) = metric_rows({"metrics": {"a": {"offroad": none}}})
+    assert row.cells[0].detail == "0/3 (0.0 to 70.8\u202f%)"
+    assert "no event in 3: only rates above 70.8 % are excluded" in row.cells[0].note
 
 
 @pytest.mark.parametrize("mean", [0.0, 1e-7, 5e6])
@@ -65,7 +69,7 @@ def test_bars_stay_on_their_axis(mean: float) -> None:
     rows = metric_rows({"metrics": {"a": {"lateral_distance_m": entry(mean, unit="m", ci95_clustered=[-1.0, 3.0])}}})
     (span,) = rows[0].spans
     assert span is not None
-    for value in (span.centre, span.low, span.high, span.inner_low, span.inner_high, span.zero):
+    for value in (span.centre, span.low, span.high, span.zero):
         assert value is not None
         assert 0.0 <= value <= 100.0
 
@@ -163,7 +167,7 @@ def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> No
     console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(render_table(json.loads((usual_run / "summary.json").read_text())))
     text = console.export_text()
-    for part in ("offroad % \u2193", "24 rollouts", "4 scenes", "of 22", "lateral_distance_m m \u2193", "preset paper", "\u00b1", DASH):
+    for part in ("offroad % \u2193", "24 rollouts", "4 scenes", "/22 (", "lateral_distance_m m \u2193", "preset paper", "\u202f%", DASH):
         assert part.replace("\u00a0", " ") in text.replace("\u00a0", " ")
 
 

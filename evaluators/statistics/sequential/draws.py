@@ -30,12 +30,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import PurePath
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Bool
+from evaluators.statistics.families import grouped
 
 
 @dataclass(frozen=True)
@@ -189,8 +189,7 @@ def families_of(paths: Mapping[str, str], with_what: str) -> dict[str, str]:
     Raises:
         InputError: There is only one family.
     """
-    by_file = len(set(paths.values())) <= len(paths) / 2
-    family = {scene: path if by_file else PurePath(path).parent.name for scene, path in paths.items()}
+    family = grouped(paths)
     names = sorted(set(family.values()))
     if len(names) < 2:
         found = f"all {len(paths)} scenes are of one family, {names[0]}"
