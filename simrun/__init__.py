@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.one_policy import serve_policy
     from alpasim_plugin.core.errors import InputError, SimrunError
     from alpasim_plugin.core.types import (
+        U8,
         CameraSpec,
         EgoState,
         Frame,
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
         Scene,
         SensorSpec,
         Trajectory,
-        U8,
     )
     from alpasim_plugin.notebook.opening import open_run
     from alpasim_plugin.runtime.cell import make_renderer
@@ -52,10 +52,39 @@ HOMES = {
 }  # fmt: skip
 
 __all__ = [
-    "CameraSpec", "EgoState", "Frame", "InputError", "MetricInfo", "MetricSeries", "Observation", "Plan", "RenderRequest", "RolloutLog",
-    "Route", "Scenario", "Scene", "SensorSpec", "SimrunError", "Trajectory", "U8", "__version__", "aggregate", "check_policy", "load_scenario",
-    "make_policy", "make_renderer", "open_run", "paired", "plan_times", "reduce_rollout", "resolve_evaluators", "rollout_values",
-    "run_rollout", "score", "series", "serve_policy",
+    "U8",
+    "CameraSpec",
+    "EgoState",
+    "Frame",
+    "InputError",
+    "MetricInfo",
+    "MetricSeries",
+    "Observation",
+    "Plan",
+    "RenderRequest",
+    "RolloutLog",
+    "Route",
+    "Scenario",
+    "Scene",
+    "SensorSpec",
+    "SimrunError",
+    "Trajectory",
+    "__version__",
+    "aggregate",
+    "check_policy",
+    "load_scenario",
+    "make_policy",
+    "make_renderer",
+    "open_run",
+    "paired",
+    "plan_times",
+    "reduce_rollout",
+    "resolve_evaluators",
+    "rollout_values",
+    "run_rollout",
+    "score",
+    "series",
+    "serve_policy",
 ]  # fmt: skip
 
 __getattr__ = lazy_names(__name__, {name: home for home, names in HOMES.items() for name in names})
