@@ -26,6 +26,7 @@ from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
+from evaluators.report.gate import gate_section
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
@@ -115,6 +116,7 @@ def context(run: Run) -> dict[str, Any]:
         "when": _when(run.info.get("started_at")),
         "finding": find(run),
         "decision": section(run),
+        "gate": gate_section(run),
         "facts": _facts(run),
         "columns": tables.columns(run),
         "variant_colour": colours,
