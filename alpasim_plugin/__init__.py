@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-OWN_PACKAGES = ("alpasim_plugin", "configs", "evaluators", "policies", "scenarios")
+OWN_PACKAGES = ("alpasim_plugin", "configs", "evaluators", "policies", "scenarios", "simrun")
 
 __all__ = ["OWN_PACKAGES", "__version__", "load_scenario", "make_policy", "make_renderer", "open_run", "run_rollout", "serve_policy"]
 

@@ -38,7 +38,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 AFTER_THE_STAGES = (A + "runtime", A + "alpasim", A + "gym", A + "recordings", A + "notebook", A + "cli")
 # Rooms that register themselves by entry points, as another distribution does. Nobody imports them.
 PLUG_INS = (A + "block_fixers", A + "lab")
-PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs")
+PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "simrun")
 ROOMS = (*BASE, *STAGES, *AFTER_THE_STAGES, *PLUG_INS)
 
 
@@ -105,7 +105,7 @@ def upward_imports(module: Module) -> list[str]:
 
 
 def test_every_module_lies_in_a_room() -> None:
-    faces = {"alpasim_plugin", "configs", "configs.can", "configs.fixers", "configs.paper"}
+    faces = {"alpasim_plugin", "simrun", "configs", "configs.can", "configs.fixers", "configs.paper"}
     assert {module.name for module in modules() if room_of(module.name) is None} - faces == set()
     assert {room for room in ROOMS if not any(room_of(module.name) == room for module in modules())} <= set(PLUG_INS)
 

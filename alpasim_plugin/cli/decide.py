@@ -22,6 +22,7 @@ from alpasim_plugin.runtime.decide import Decided, Design, arms_asked, execute_d
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan
 from evaluators.opening import read_run
 from evaluators.report.decision import metric_lines, verdict_line
+from evaluators.report.numbers import plural
 from evaluators.statistics.arms import Arm, arms_of, base_named, usual_base
 from evaluators.statistics.baselines import StoredSide, check_made_alike, read_baseline, rows_of_run, stored_side
 from evaluators.statistics.gate import GateSpec, load_gate
@@ -300,7 +301,14 @@ def decide_into(
         quiet: No progress.
         stored: The baseline's side, where it was driven earlier.
         how: Further arguments of `execute_decision`.
+
+    Raises:
+        InputError: The scenes are fewer than a decision takes, whatever they show: nothing is driven.
     """
+    scenes, least = len(plan.scenarios), question.min_scenes
+    if scenes < least:
+        do_this = "name more scenes, or drive these and judge all of them: simrun --renderer A,B SCENARIO..., then simrun gate RUN"
+        raise InputError(DOING, plural(scenes, "scene"), f"nothing is decided on fewer than {least} (min_scenes)", do_this)
     plan = replace(plan, question=key_of(question, design, controls, stored))
     folder = root or Path("runs", f"decide-{slug(next(iter(plan.scenarios)))}-{plan.command_key}")  # by the command alone
     progress = SilentLooks() if quiet else LookLines()

@@ -26,9 +26,12 @@ from alpasim_plugin.cli.options import Json, Only, What, Where
 from alpasim_plugin.cli.progress import make_progress, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.run_folder.manifests import read_run_json
+from alpasim_plugin.run_folder.schema import PAGES
 from alpasim_plugin.runtime.decide import Design
 from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.self_test import run_self_test
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
@@ -126,7 +129,8 @@ def gate(
         stored = read_baseline(baseline_file)
         check_matches(stored, found, baseline_file)
     verdict = judge_table(table_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""), found.table)
-    files = write_gate_files(verdict, source, found, out or run)
+    files = write_gate_files(verdict, source, found, out or run, None if stored is None else stored.rows)
+    _show_in_report(run, out)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "files": [str(path) for path in files]}))
     else:
@@ -159,13 +163,20 @@ def _until_decided(
     rows = rows_of_run(found)
     driven = {(str(row["scene"]), int(row["seed"])) for row in rows}
     verdict = judge_decided(rows, spec, decided.record, None if stored is None else stored.of_cells(driven), found.table)
-    files = write_gate_files(verdict, source, found, out or run)
+    files = write_gate_files(verdict, source, found, out or run, None if stored is None else stored.of_cells(driven))
+    _show_in_report(run, out)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "decision": decided.record, "files": [str(path) for path in files]}))
     else:
         print_verdict(verdict)
         print_end(decided)
     return verdict.exit_code
+
+
+def _show_in_report(run: Path, out: Path | None) -> None:
+    """Write the run's report again, with the gate in it; one that is not there stays away, as does that of a gate kept elsewhere."""
+    if out is None and (run / PAGES[0]).is_file():
+        write_reports(run, flips=read_run_json(run).get("kind") != "score")
 
 
 def print_verdict(verdict: GateVerdict) -> None:

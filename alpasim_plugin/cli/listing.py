@@ -24,7 +24,7 @@ def list_parts(
 ) -> None:
     """List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help."""
     tables: dict[str, Callable[[], dict[str, str]]] = {
-        "renderers": lambda: names("renderer"),
+        "renderers": _renderers,
         "fixers": _fixers,
         "policies": lambda: names("policy"),
         "controllers": lambda: names("controller"),
@@ -42,8 +42,13 @@ def list_parts(
         print(f"{name:<{width}}  {help_text}")
 
 
+def _renderers() -> dict[str, str]:
+    """Return every renderer, and the fixers that a renderer may be named by: each stands for ``NAME+3dgs``."""
+    return names("renderer") | {name: f"3dgs, repaired by the fixer {name}: {text}" for name, text in names("fixer").items()}
+
+
 def _fixers() -> dict[str, str]:
-    """Return every fixer with its help and whose weights it has; as a renderer each stands for ``NAME+3dgs``."""
+    """Return every fixer with its help and whose weights it has."""
     listed = {}
     for name, help_text in names("fixer").items():
         spec = unidentified("fixer", name)

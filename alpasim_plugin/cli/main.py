@@ -43,7 +43,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "export": "export:export",
     },
     "Extend": {"list": "listing:list_parts", "new": "new:new", "check-policy": "check_policy:check_policy"},
-    "Check": {"check": "check:check", "doctor": "doctor:doctor"},
+    "Check and read": {"check": "check:check", "doctor": "doctor:doctor", "docs": "docs:docs"},
 }  # fmt: skip
 PLUGINS = "From installed packages"
 GROUP = "simrun.commands"

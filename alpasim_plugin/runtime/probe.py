@@ -147,15 +147,11 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
         raise InputError(DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers")
-    queries = replay(past, renderers)
-    if not queries[0].frames:
-        raise InputError(
-            DOING, past.name, f"the policy {past.cell.policy.name!r} has no camera", "probe a rollout of a policy with cameras"
-        )
+    queries = replay(past, renderers, must_see=True)
     return Probe(queries, tuple(compare(queries, renderers[0], name) for name in renderers[1:]))
 
 
-def replay(past: LoggedRollout, renderers: Sequence[str] = ()) -> tuple[PolicyQuery, ...]:
+def replay(past: LoggedRollout, renderers: Sequence[str] = (), must_see: bool = False) -> tuple[PolicyQuery, ...]:
     """Drive a logged rollout again and return its queries, with what these renderers beside its own show at its poses.
 
     Raises:
@@ -169,6 +165,8 @@ def replay(past: LoggedRollout, renderers: Sequence[str] = ()) -> tuple[PolicyQu
     parts = {name: build_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
     renderer = _MultiRenderer({name: p.renderer for name, p in parts.items()}, own.renderer.name)
     policy = _MultiPolicy({name: p.policy for name, p in parts.items()}, renderer)
+    if must_see and not policy.sensors:
+        raise InputError(DOING, past.name, f"the policy {own.policy.name!r} has no camera", "probe a rollout of a policy with cameras")
     with temporary_folder("simrun-probe-") as folder:
         with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
             run_rollout(past.scenario, renderer, policy, own.seed, recorder, parts[own.renderer.name].controller)

@@ -77,7 +77,7 @@ def explain(past: LoggedRollout, run: Run, say: Say) -> Cause:
         seed=past.cell.seed,
         its_route=past.scenario.route,
     )
-    driven = [_drive(past, tried, say) for tried in findings.promising(MOST_DRIVES)] if failed_us is not None else []
+    driven = _drives(past, findings.promising(MOST_DRIVES), say) if failed_us is not None else []
     partings = [*_by_renderer(past, run, until), *_by_policy(past, run, rollout)]
     return Cause(
         rollout=rollout,
@@ -120,6 +120,16 @@ def _tried(findings: Findings, driven: Sequence[Driven]) -> list[tuple[str, str,
     errors = [one.why_not if one.error_m is None else f"{one.error_m:.2f} m" for one in findings.tried]
     names = [one.trial.name for one in findings.tried]
     return [("none", f"{findings.own_error_m:.2f} m", ""), *((n, error, ends.get(n, "")) for n, error in zip(names, errors, strict=True))]
+
+
+def _drives(past: LoggedRollout, promising: Sequence[Tried], say: Say) -> list[Driven]:
+    """Drive with one change after the other, until one mends the drive."""
+    driven: list[Driven] = []
+    for tried in promising:
+        driven.append(_drive(past, tried, say))
+        if driven[-1].mends:
+            break
+    return driven
 
 
 def _drive(past: LoggedRollout, tried: Tried, say: Say) -> Driven:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.escape import terminal
@@ -13,12 +14,14 @@ from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.sides import Row
 from evaluators.metrics.outcomes import in_words, outcomes_of, told
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
+from evaluators.report.gate import worst_of, write_gate
 from evaluators.report.headline import LEADING, find
-from evaluators.report.numbers import Cell, plural
+from evaluators.report.numbers import Cell, plural, short
 from evaluators.report.provenance import LEDGER_COLUMNS, failure_rows, ledger, provenance
 from evaluators.statistics.gate import Check, GateVerdict
 
@@ -200,13 +203,14 @@ def _properties(parent: ET.Element, values: dict[str, str]) -> None:
             ET.SubElement(holder, "property", {"name": clean(name), "value": clean(value)})
 
 
-def gate_md(verdict: GateVerdict, gate: str, run: str) -> str:
-    """Render a verdict as Markdown: heading, what led to it, every check.
+def gate_md(verdict: GateVerdict, gate: str, run: str, worst: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Render a verdict as Markdown: heading, what led to it, every check, the scenes that did worst.
 
     Args:
         verdict: What `judge` gave.
         gate: Name or file of the gate.
         run: Name or folder of the run.
+        worst: As `evaluators.report.gate.worst_of` gives it.
     """
     head = f"## Gate: {verdict.outcome.title}\n\n"
     head += f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. Exit code {verdict.exit_code}.\n\n"
@@ -218,22 +222,30 @@ def gate_md(verdict: GateVerdict, gate: str, run: str) -> str:
     checks = "\n" + table(["metric", "renderer", "result", "rule", "numbers"], rows) if rows else ""
     failures = verdict.failures
     failed = f"\n{failures['n_failed']} of {failures['n_rollouts']} rollouts failed.\n" if failures["n_failed"] else ""
-    return head + reasons + checks + failed
+    pairs = [
+        [pair["scene"], f"{pair['renderer']}/{pair['policy']}", str(pair["seed"]), pair["metric"], short(pair["was"]), short(pair["now"])]
+        for pair in worst
+    ]
+    scenes = "\nThe worst scenes:\n\n" + table(["scene", "renderer", "seed", "metric", "baseline", "now"], pairs) if pairs else ""
+    return head + reasons + checks + scenes + failed
 
 
-def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) -> list[Path]:
-    """Write ``gate.md`` and ``gate.junit.xml``; append the Markdown to the file that $GITHUB_STEP_SUMMARY names.
+def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path, stored: Sequence[Row] | None = None) -> list[Path]:
+    """Write ``gate.md``, ``gate.junit.xml`` and in the run folder ``gate.json``; append the Markdown to what $GITHUB_STEP_SUMMARY names.
 
     Raises:
         InfrastructureError: The disk refused.
     """
-    text = gate_md(verdict, gate, str(run.folder))
+    worst = worst_of(run, verdict, stored)
+    text = gate_md(verdict, gate, str(run.folder), worst)
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
     write_text(page, cut(text), "writing a report")
     tests = _write_xml(folder / "gate.junit.xml", gate_junit(verdict, gate, run))
     append_job_summary(text)
-    return [page, tests]
+    if folder.resolve() != run.folder.resolve():
+        return [page, tests]
+    return [page, tests, write_gate(run, verdict, gate, worst)]
 
 
 def append_job_summary(text: str) -> Path | None:

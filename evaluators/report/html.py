@@ -26,10 +26,12 @@ from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
+from evaluators.report.gate import gate_section
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
 from evaluators.report.rollouts import read_series, rollout_block
+from evaluators.report.shots import shots
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 
@@ -114,7 +116,9 @@ def context(run: Run) -> dict[str, Any]:
         "title": ", ".join(run.renderers) or "empty run",
         "when": _when(run.info.get("started_at")),
         "finding": find(run),
+        "shots": shots(run, interesting),
         "decision": section(run),
+        "gate": gate_section(run),
         "facts": _facts(run),
         "columns": tables.columns(run),
         "variant_colour": colours,

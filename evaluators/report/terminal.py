@@ -14,6 +14,7 @@ from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
+from evaluators.metrics.outcomes import outcomes_of
 from evaluators.opening import Run
 from evaluators.report.flips import find_flips, flip_bases
 from evaluators.report.headline import Finding, find
@@ -146,12 +147,15 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
         names = run.renderers if len(run.renderers) > 1 else [*run.renderers, _other(run)]
         why = "a policy that looks: without a camera it drives alike behind every renderer"
         return _again(run, names, run.scenes_asked or [MORE_SCENES], SEEING), why
+    flips, _ = find_flips(run)
+    changed = [one for flip in flips for one in (flip.other, flip.base)]
+    ended = next((one for one in [*changed, *run.rollouts] if outcomes_of(one)), None)
+    if ended is not None:
+        words = ["simrun", "why", f"{run.folder}/{_named(ended)}"]
+        return words, "what the policy saw and planned there, and which single change mends it"
     if not finding.points or len(run.renderers) * len(run.policies) == 1:
         more = _other(run)
         return _again(run, [*run.renderers, more], run.scenes_asked or [MORE_SCENES]), f"compares with {more}, pair by pair"
-    flips, _ = find_flips(run)
-    if flips:
-        return _of_pair(run, flips[0].base, flips[0].other)
     if finding.tone == "unclear":
         return _again(run, run.renderers, [MORE_SCENES]), "more scenes: the interval is too wide to decide"
     point = finding.points[0]

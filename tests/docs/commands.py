@@ -27,6 +27,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         "trains or measures for minutes to days, or needs what that made",
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
+    (r"^why ", "names a drive of the reader's; tests/runtime/test_why.py runs it"),
     (r"--rrd", "needs rerun-sdk, half a gigabyte; tests/recordings/test_rrd.py reads what it writes"),
     (r"view .*--serve", "goes on until it is stopped; tests/viewer/test_view_server.py asks it"),
     (

@@ -155,7 +155,7 @@ def shortened(words: tuple[str, ...]) -> list[str]:
     """Return a command that does the same in seconds: short drives, one seed, nothing fitted."""
     if words[:3] == ("new", "policy", "my_policy"):
         return ["new", "policy", "my_first_policy"]  # the folder has a policy of the page's name already
-    args = ["scenario.yaml" if word == "SCENARIO" else word.replace("suites/urban", "suites/smoke") for word in words]
+    args = ["scenario.yaml" if word == "SCENARIO" else re.sub("suites/(urban|hard)", "suites/smoke", word) for word in words]
     if args[0] not in verbs() or args[0] == "run":
         fitting = [] if "suites/first" in args else NOTHING_FITTED
         short = LONGER if "--timeline" in args else SHORT

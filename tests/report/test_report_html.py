@@ -96,12 +96,12 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path, usua
             assert (usual_run / unquote(address)).exists(), address
 
 
-def test_the_bar_and_the_headings_use_the_same_names(usual_run: Path, usual_page: Page) -> None:
+def test_the_bar_names_few_parts_by_their_headings(usual_run: Path, usual_page: Page) -> None:
     text = (usual_run / "report.html").read_text()
     bar = dict(re.findall(r'<a href="#([a-z]+)">([^<(]+?)(?: \(\d+\))?</a>', text[text.index("<nav") : text.index("</nav>")]))
-    headings = dict(re.findall(r'<section id="([a-z]+)">\s*<h2>([^<]+)</h2>', text))
-    assert bar == headings
-    assert len(bar) >= 8
+    headings = dict(re.findall(r'<section id="([a-z]+)">\s*<h2>([^<]+)</h2>', text)) | {"frames": "Pictures"}
+    assert bar.items() <= headings.items()
+    assert 4 <= len(bar) <= 7
 
 
 @pytest.mark.slow

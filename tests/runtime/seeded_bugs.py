@@ -1,4 +1,4 @@
-"""Twelve drivers with a fault each, to be named by the page of causes: `LaneCamera` or `Learned` with one thing wrong."""
+"""Twelve drivers with a fault each, to be named by the page of causes: `LaneCamera`, `Learned` or `ByYellow` with one thing wrong."""
 
 from __future__ import annotations
 
@@ -45,14 +45,32 @@ class Latency(LaneCamera):
         return super().act(replace(observation, frames=shown, route_rig=late.route_rig))
 
 
-class SwappedChannels(Learned):
+class ByYellow(LaneCamera):
+    """Keeps right of the yellow line, which it finds by its colour some metres ahead."""
+
+    AHEAD_M, BESIDE_M = 7.0, 1.8
+
+    def act(self, observation: Observation) -> Plan:
+        c = self.camera
+        p = np.linalg.inv(c.T_rig_camera) @ [self.AHEAD_M, 0.0, 0.0, 1.0]
+        row = round(float(c.K[1, 1] * p[1] / p[2] + c.K[1, 2]))
+        red, _, blue = observation.frames[c.name].rgb[row - 2 : row + 3].astype(float).mean(axis=0).T
+        columns = np.flatnonzero(red - blue > 45)
+        left_m = -(columns.mean() - c.K[0, 2]) * p[2] / c.K[0, 0] - self.BESIDE_M if len(columns) else 0.0
+        t = 1e-6 * 100_000 * np.arange(41)
+        bend = 2 * left_m / self.AHEAD_M**2
+        x = observation.ego.speed_mps * t
+        return Plan(observation.t_us, observation.t_us + (1e6 * t).astype(np.int64), np.stack([x, bend * x**2 / 2], axis=1), bend * x)
+
+
+class SwappedChannels(ByYellow):
     """Red and blue are exchanged."""
 
     def act(self, observation: Observation) -> Plan:
         return super().act(_shown(observation, lambda rgb: rgb[..., ::-1].copy()))
 
 
-class WrongFocalLength(LaneCamera):
+class WrongFocalLength(ByYellow):
     """The focal length is believed to be 1.5 times what it is."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -97,11 +115,11 @@ class WorldAxes(LaneCamera):
         return replace(plan, xy=plan.xy @ np.array([[c, s], [-s, c]]), yaw=plan.yaw + yaw, samples=())
 
 
-class WrongPitch(LaneCamera):
-    """The camera is believed to look three degrees further up than it does."""
+class WrongPitch(ByYellow):
+    """The camera is believed to look six degrees further down than it does."""
 
     def __init__(self, scenario: Scenario) -> None:
-        a = np.deg2rad(3.0)
+        a = np.deg2rad(-6.0)
         pitch = np.array([[1, 0, 0, 0], [0, np.cos(a), -np.sin(a), 0], [0, np.sin(a), np.cos(a), 0], [0, 0, 0, 1.0]])
         super().__init__(_wrong_camera(scenario, lambda c: replace(c, T_rig_camera=c.T_rig_camera @ pitch)))
 

@@ -242,6 +242,13 @@ def test_questions_that_cannot_be_asked_are_refused(more, found, tmp_path: Path,
     assert not (tmp_path / "run").exists()
 
 
+def test_fewer_scenes_than_a_decision_takes_are_refused_before_one_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["gate", str(tmp_path / "run"), "--until-decided", "--scenes", "smoke/straight", "--renderer", f"{GREY},{DARKER}"]
+    assert run_command(words) == 2
+    assert "nothing is decided on fewer than 20 (min_scenes)" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> None:
     gate = tmp_path / "gate.yaml"

@@ -17,11 +17,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.run_folder.rows import series_by_cell
 from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, shown_by_default
 from alpasim_plugin.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
-from alpasim_plugin.viewer.page_data import cell_data, read_logs
+from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.opening import read_run
 from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
@@ -258,3 +259,22 @@ def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run: Path, tmp
 
 def test_the_whole_drive_of_the_fixture_is_watched(watched_run: Path) -> None:
     assert {cell.scene for cell in cells_of(read_run(watched_run))} == set(WATCHED.scenes)
+
+
+def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path: Path) -> None:
+    plan = Plan(renderers=("clean",), policies=("one", "two"), scenes=("urban-left_turn",), seeds=(0,), steps=12)
+    run = read_run(make_watched(tmp_path / "run", plan, actors=0))
+    (cell,) = cells_of(run, arms=True)
+    assert [cell.side(one) for one in cell.rollouts] == ["one", "two"] == list(cell.outcomes())
+    document = cell_data(run, cell, read_logs(run, cell), Fineness())
+    assert [drive["renderer"] for drive in document["drives"]] == ["one", "two"]
+    assert index_data(run, [cell], [cell], {})["renderers"] == ["one", "two"]
+    assert len(cells_of(run)) == 2  # a recording for other tools holds one policy
+
+
+def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run: Path) -> None:
+    run = read_run(small_run)
+    cell = cells_of(run)[0]
+    drive = cell_data(run, cell, read_logs(run, cell), Fineness(width_px=32))["drives"][0]
+    assert drive["cameras"][0]["lens"] == {"k": [20.0, 20.0, 16.0, 9.0], "T": np.eye(4)[:3].ravel().tolist()}
+    assert drive["rear"] == round(100 * Vehicle().rear_axle_to_centre_m)

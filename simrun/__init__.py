@@ -1,0 +1,90 @@
+"""simrun: what a user's own code imports. Every name is loaded on first use, so that a type costs no rasteriser and no torch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from alpasim_plugin import __version__
+from alpasim_plugin.core.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from alpasim_plugin.alpasim.server.one_policy import serve_policy
+    from alpasim_plugin.core.errors import InputError, SimrunError
+    from alpasim_plugin.core.types import (
+        U8,
+        CameraSpec,
+        EgoState,
+        Frame,
+        MetricInfo,
+        MetricSeries,
+        Observation,
+        Plan,
+        RenderRequest,
+        RolloutLog,
+        Route,
+        Scenario,
+        Scene,
+        SensorSpec,
+        Trajectory,
+    )
+    from alpasim_plugin.notebook.opening import open_run
+    from alpasim_plugin.runtime.cell import make_renderer
+    from alpasim_plugin.runtime.rollout import run_rollout
+    from evaluators import aggregate, paired, reduce_rollout, resolve_evaluators, rollout_values, score, series
+    from policies import check_policy, make_policy
+    from policies.base import plan_times
+    from scenarios.load import load_scenario
+
+HOMES = {
+    "alpasim_plugin.alpasim.server.one_policy": ["serve_policy"],
+    "alpasim_plugin.core.errors": ["InputError", "SimrunError"],
+    "alpasim_plugin.core.types": [
+        "CameraSpec", "EgoState", "Frame", "MetricInfo", "MetricSeries", "Observation", "Plan", "RenderRequest", "RolloutLog", "Route",
+        "Scenario", "Scene", "SensorSpec", "Trajectory", "U8",
+    ],
+    "alpasim_plugin.notebook.opening": ["open_run"],
+    "alpasim_plugin.runtime.cell": ["make_renderer"],
+    "alpasim_plugin.runtime.rollout": ["run_rollout"],
+    "evaluators": ["aggregate", "paired", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series"],
+    "policies": ["check_policy", "make_policy"],
+    "policies.base": ["plan_times"],
+    "scenarios.load": ["load_scenario"],
+}  # fmt: skip
+
+__all__ = [
+    "U8",
+    "CameraSpec",
+    "EgoState",
+    "Frame",
+    "InputError",
+    "MetricInfo",
+    "MetricSeries",
+    "Observation",
+    "Plan",
+    "RenderRequest",
+    "RolloutLog",
+    "Route",
+    "Scenario",
+    "Scene",
+    "SensorSpec",
+    "SimrunError",
+    "Trajectory",
+    "__version__",
+    "aggregate",
+    "check_policy",
+    "load_scenario",
+    "make_policy",
+    "make_renderer",
+    "open_run",
+    "paired",
+    "plan_times",
+    "reduce_rollout",
+    "resolve_evaluators",
+    "rollout_values",
+    "run_rollout",
+    "score",
+    "series",
+    "serve_policy",
+]  # fmt: skip
+
+__getattr__ = lazy_names(__name__, {name: home for home, names in HOMES.items() for name in names})

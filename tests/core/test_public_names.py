@@ -1,0 +1,29 @@
+"""``import simrun``: the names that a user's own code imports."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import simrun
+from alpasim_plugin.plugins.parts.source import reached
+
+
+def test_every_public_name_is_there_and_has_one_home(repo: Path) -> None:
+    listed = {name for names in simrun.HOMES.values() for name in names}
+    assert listed | {"__version__"} == set(simrun.__all__)
+    code = (
+        "import sys, simrun; [getattr(simrun, n) for n in ('Plan', 'InputError', 'plan_times')]; print({'torch', 'numba'} & {*sys.modules})"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=repo, check=True)
+    assert told.stdout.strip() == "set()"
+    assert simrun.load_scenario.__module__ == "scenarios.load"
+
+
+def test_code_that_imports_a_name_is_digested_with_its_home(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("from simrun import Plan, plan_times\n")
+    files = {Path(path).as_posix() for path in reached(tmp_path / "mine.py")}
+    assert any(path.endswith("policies/base.py") for path in files)
+    assert any(path.endswith("core/types.py") for path in files)
+    assert not any("/runtime/" in path for path in files)

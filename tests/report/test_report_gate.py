@@ -1,0 +1,46 @@
+"""The gate at the head of the report: verdict, baseline, every check, the worst scenes first."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+from evaluators.opening import read_run
+from evaluators.report import html
+from evaluators.report.ci import write_gate_files
+from evaluators.report.gate import gate_section
+from evaluators.statistics.baselines import rows_of_run
+from evaluators.statistics.gate import judge, load_gate
+
+
+def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usual_run: Path, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(usual_run, root)
+    run = read_run(root)
+    spec, source = load_gate("default", run.table)
+    verdict = judge(rows_of_run(run), spec, None, "", run.table)
+    files = write_gate_files(verdict, source, run, root)
+    assert [file.name for file in files] == ["gate.md", "gate.junit.xml", "gate.json"]
+    section = gate_section(run)
+    assert section is not None
+    assert (section.exit_code, section.baseline) == (verdict.exit_code, verdict.baseline)
+    assert len(section.checks) == len(verdict.checks)
+    assert section.worst
+    first = [row for row in section.worst if row[2] == section.worst[0][2]]
+    assert all((run.folder / str(row[5])).exists() for row in first)
+    page = html.render_report(run)
+    assert page.index('id="gate"') < page.index('id="results"')
+    assert section.worst[0][0] in page[page.index('id="table-gate-worst"') :]
+    assert section.worst[0][0] in (root / "gate.md").read_text()
+    table = pq.read_table(root / "rollouts.parquet")
+    pq.write_table(table.slice(0, table.num_rows - 1), root / "rollouts.parquet")
+    assert gate_section(read_run(root)) is None
+
+
+def test_three_pictures_stand_under_the_verdict(usual_run: Path) -> None:
+    page = html.render_report(read_run(usual_run))
+    head = page[page.index('class="verdict"') : page.index('class="facts"')]
+    assert 1 <= head.count("<img") <= 3
+    assert page.index("<h1") < page.index('class="shots"')
