@@ -37,9 +37,9 @@ from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
 from scenarios.recorded import RecordedLog
 
 SCENARIO_FILE, KEY_FILE, FIT_FOLDER, POINTS_FILE = "scenario.yaml", "import.json", "fit", "points.ply"
-EVERY = 8  # one photograph of so many is held out
-FIT_PX = 608  # least width of fitted views; half of the photograph's where that is more
-RENDER_PX, SIDE_PX = 640, 16  # most width of the scenario's cameras; what their sides are multiples of, as fixers need
+EVERY, EVERY_STILL = 8, 5  # one photograph of so many is held out; of those that were not taken along a road, which are fewer
+FIT_PX = 608  # least longer side of fitted views; half of the photograph's where that is more
+RENDER_PX, SIDE_PX = 640, 16  # most of the longer side of the scenario's cameras; what their sides are multiples of, as fixers need
 SEED = 0  # of the fit
 HELD_US = 150_000  # cameras and the sensor that tracks are not triggered at once
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
@@ -69,7 +69,8 @@ class Shown:
     def view(self) -> PosedView:
         """Return it as a view of the width that is fitted."""
         full = replace(self.picture, T_world_camera=self.T_world_camera).view()
-        width = max(min(full.camera.width, FIT_PX), -(-full.camera.width // 2))
+        whole = full.camera.width
+        width = max(min(whole, FIT_PX * whole // max(whole, full.camera.height)), -(-whole // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
         return replace(small, name=f"{self.camera}-{self.picture.file.stem}", actors=self.actors)
 
@@ -225,11 +226,12 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
 def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
     """Return all photographs with their names, uses and places."""
     first_us = int(placed.ego.t_us[0])
+    every = EVERY if placed.strip else EVERY_STILL
     out = []
     for camera in drive.cameras:
         name = camera if camera != drive.front or "front" in camera else "front"
         for i, one in enumerate(drive.of(camera)):
-            held = i % EVERY == EVERY // 2 and len(drive.of(camera)) >= EVERY
+            held = i % every == every // 2 and len(drive.of(camera)) >= EVERY
             use = "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
             ending = one.file.suffix.lower() if not one.lens.bends else ".png"
             picture = replace(one, t_us=int(one.t_us or 0) - first_us)
@@ -291,7 +293,7 @@ def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
     """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the middle."""
     picture = drive.of(name)[0]
     lens = picture.lens
-    width = min(RENDER_PX, lens.width) // SIDE_PX * SIDE_PX
+    width = min(RENDER_PX * lens.width // max(lens.width, lens.height), lens.width) // SIDE_PX * SIDE_PX
     scale = width / lens.width
     height = max(SIDE_PX, int(lens.height * scale) // SIDE_PX * SIDE_PX)
     K = np.diag([scale, scale, 1.0]) @ lens.straight_K()

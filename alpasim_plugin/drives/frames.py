@@ -22,7 +22,7 @@ from alpasim_plugin.io.reading.images import check_image, decode_image, picture_
 DOING = "finding the poses of photographs"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
-MOST, WIDTH_PX = 80, 1600  # pictures that are kept; their greatest width
+MOST, WIDTH_PX = 80, 1280  # pictures that are kept; their greatest width
 SMALL_PX = 320  # width at which pictures are compared
 BLACK = 8.0  # mean grey of a picture that shows nothing
 MOVED_PX = 0.6  # at `SMALL_PX`, by which four of ten corners must have moved since the picture before

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.geometry import matrix_from_quat
-from alpasim_plugin.core.types import F64, STANDING_ID, Bool, Box, HeightField, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, Box, HeightField, Trajectory, Vehicle
 from alpasim_plugin.drives.ground import PathFrame
 from alpasim_plugin.drives.source import Points
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -24,6 +24,7 @@ OPAQUE, LARGEST_M = 0.3, 0.6  # of a Gaussian that counts; larger ones are backg
 CELL_M, PIECE_M, REACH_M = 0.2, 1.0, 9.0  # of the grid, of a box along the path, and from the path
 LEAST_M2 = 0.06  # of opaque surface in a column of a cell: a wall has 0.34
 FEWEST = 3  # cells of something that stands
+GAP_M = 1.2  # a gap in something that no car fits into is closed: dark doors and windows leave some in parked cars
 SPARE_M = 0.1  # beside the recorded car that it drove through unhurt
 UNSEEN_M = 0.5  # uncertainty where no point is near
 NEAR_M = 1.0
@@ -62,14 +63,20 @@ def standing_obstacles(cloud: GaussianCloud, points: Points, ground: HeightField
     occupied = grid > LEAST_M2
     driven = _driven(occupied, low, ego, vehicle)
     cleared = int((occupied & driven).sum())
-    occupied &= ~driven
+    occupied = scipy.ndimage.binary_closing(occupied, _disc(GAP_M / 2)) & ~driven
     label, _ = scipy.ndimage.label(occupied, structure=np.ones((3, 3)))
     sizes = np.bincount(label.ravel())
     sizes[0] = 0
     kept = np.argwhere((sizes >= FEWEST)[label] & occupied)
     at = low + (kept - 0.5) * CELL_M  # the cells' middles: the grid has a border of one cell
     tops = _tops(places, above, low, grid.shape)[kept[:, 0], kept[:, 1]]
-    return Standing(tuple(_boxes(at, label[kept[:, 0], kept[:, 1]], tops, frame, ground, points)), cleared)
+    return Standing(tuple(_boxes(at, kept, tops, frame, ground, points)), cleared)
+
+
+def _disc(radius_m: float) -> Bool:
+    n = int(radius_m / CELL_M)
+    x, y = np.mgrid[-n : n + 1, -n : n + 1]
+    return np.asarray(np.hypot(x, y) <= radius_m / CELL_M)
 
 
 def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
@@ -101,13 +108,19 @@ def _tops(places: F64, above: F64, low: F64, shape: tuple[int, ...]) -> F64:
     tops = np.zeros(shape)
     cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64) + 1
     np.maximum.at(tops, (cells[:, 0], cells[:, 1]), above)
-    return tops
+    return np.where(tops > 0, tops, scipy.ndimage.grey_dilation(tops, footprint=_disc(GAP_M / 2)))  # of cells in gaps: their neighbours'
 
 
-def _boxes(at: F64, label: F64, tops: F64, frame: PathFrame, ground: HeightField, points: Points) -> list[Obstacle]:
-    """Return boxes around pieces of connected cells, along the path's own direction."""
+def _boxes(at: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField, points: Points) -> list[Obstacle]:
+    """Return boxes around cells ``(N, 2)`` that are connected within a piece of the path, along the path's own direction."""
     s, left, _ = frame.place(at)
     piece = np.floor(s / PIECE_M).astype(np.int64)
+    label = np.zeros(len(cells), dtype=np.int64)
+    for number in np.unique(piece):
+        mine = piece == number
+        grid = np.zeros(cells.max(axis=0) + 1, dtype=bool)
+        grid[cells[mine, 0], cells[mine, 1]] = True
+        label[mine] = scipy.ndimage.label(grid, structure=np.ones((3, 3)))[0][cells[mine, 0], cells[mine, 1]]
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
     out: list[Obstacle] = []
     for one in np.unique(np.stack([label, piece, left > 0], axis=1).astype(np.int64), axis=0):

@@ -80,7 +80,10 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     ego, mounts, mount_notes = _rig(drive, T, poses, field)
     notes = [found_up, scale_note, *mount_notes]
     if strip is None:
-        notes.append(f"the ground below the path was not seen: it is taken {height:g} m below the camera")
+        notes.append(
+            f"the ground below the path was not seen: it is taken {height:g} m below the camera. Renderers can be judged by these "
+            "photographs (simrun bench real); a drive needs photographs taken along a road"
+        )
     return PlacedDrive(
         T, moved, field, strip, ego, mounts, poses, tuple(_moved_actor(T, one) for one in drive.tracks),
         {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)}, tuple(notes),

@@ -54,6 +54,19 @@ def test_a_parked_car_stands_where_it_is_seen() -> None:
     assert [one.uncertainty_m for one in found] == pytest.approx([0.11] * len(found), abs=0.01)
 
 
+def test_dark_doors_leave_no_hole_to_drive_into_and_what_stands_behind_is_apart() -> None:
+    body = surface(LOW, HIGH, 4000)
+    doors = (body[:, 0] > 13.7) & (body[:, 0] < 14.7) & (body[:, 1] < 3.0)
+    hedge = surface(np.array([8.0, 5.2, 0.0]), np.array([20.0, 5.6, 1.2]), 4000)
+    seen = np.concatenate([body[~doors], hedge])
+    found = standing_obstacles(cloud_at(seen), points_at(seen[::20], 0.05), flat(), straight(), Vehicle()).obstacles
+    sides = [(one.xyz[1] - one.box.width_m / 2, one.xyz[1] + one.box.width_m / 2) for one in found]
+    assert all(high < 3.9 or low > 4.7 for low, high in sides)
+    for x in np.arange(12.2, 16.3, 0.4):
+        near = [low for one, (low, _) in zip(found, sides, strict=True) if abs(x - one.xyz[0]) < one.box.length_m / 2 + 0.1]
+        assert min(near) == pytest.approx(LOW[1], abs=0.3)
+
+
 def test_the_driven_path_is_free_and_what_was_opaque_there_is_counted() -> None:
     body = surface(LOW - np.array([0, 2.5, 0]), HIGH - np.array([0, 2.5, 0]), 4000)  # in the way
     found = standing_obstacles(cloud_at(body), points_at(body, 0.05), flat(), straight(), Vehicle())

@@ -1,6 +1,6 @@
 """ColorVideoVDP (Mantiuk et al. 2024): how far apart two pictures look, in units of just-objectionable differences; 10 is the same.
 
-The package ``cvvdp`` (MIT) is not a dependency: install it beside (``pip install cvvdp``). Its parameters ship in its wheel, so nothing is
+The package ``cvvdp`` (MIT) is not a dependency: install it beside (`HOW`). Its parameters ship in its wheel, so nothing is
 downloaded and nothing here trained it. The display is its ``standard_fhd``.
 """
 
@@ -15,7 +15,8 @@ import numpy as np
 from alpasim_plugin.core.types import F64, U8
 
 DISPLAY = "standard_fhd"
-HOW = "install it with 'pip install cvvdp'"
+# Beside a torch without CUDA only a torchvision without it loads, which this index has.
+HOW = "pip install cvvdp --extra-index-url https://download.pytorch.org/whl/cpu"
 
 
 class ColourVideoVDP:
@@ -38,7 +39,7 @@ def load_metric() -> tuple[ColourVideoVDP | None, str]:
             warnings.simplefilter("ignore")
             package = importlib.import_module("pycvvdp")
     except ModuleNotFoundError as error:
-        return None, f"cvvdp_jod is not measured: there is no module {error.name!r}; {HOW}"
+        return None, f"cvvdp_jod is not measured: there is no module {error.name!r}; install it: {HOW}"
     except (ImportError, OSError, RuntimeError) as error:  # its own dependencies may not fit the torch that is here
-        return None, f"cvvdp_jod is not measured: {type(error).__name__}: {str(error).splitlines()[0]}"
+        return None, f"cvvdp_jod is not measured: {type(error).__name__}: {str(error).splitlines()[0]}; install what fits: {HOW}"
     return ColourVideoVDP(package), ""
