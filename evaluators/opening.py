@@ -7,6 +7,7 @@ from pathlib import Path
 
 from alpasim_plugin.run_folder import reader
 from alpasim_plugin.run_folder.reader import RunSoFar
+from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE
 from evaluators.metrics import MetricTable
 
 
@@ -25,8 +26,10 @@ class Run(reader.Run):
 
 
 def read_run(run_dir: Path | str) -> Run:
-    """Read a run folder; see `alpasim_plugin.run_folder.reader.read_run`."""
-    return Run.of(reader.read_run(run_dir))
+    """Read a run folder, whose rates must lie in [0, 1]; see `alpasim_plugin.run_folder.reader.read_run`."""
+    run = Run.of(reader.read_run(run_dir))
+    ROLLOUTS_TABLE.check(run.folder / ROLLOUTS, rates=run.table.rates)
+    return run
 
 
 def read_so_far(root: Path) -> RunSoFar[Run]:

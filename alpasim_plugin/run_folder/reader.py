@@ -253,6 +253,7 @@ def read_so_far(root: Path) -> RunSoFar[Run]:
     info = read_run_json(root)
     cells = planned_cells(info)
     states = [inspect_rollout(root, cell) for cell in cells]
-    table = rollout_table([state.manifest for state in states if state.manifest is not None and not state.damage])
+    with parsing(DOING, root, AGAIN, "manifests from which no table can be made"):
+        table = rollout_table([state.manifest for state in states if state.manifest is not None and not state.damage])
     damage = tuple(str(one) for state in states for one in state.damage)
     return RunSoFar(Run(root, info, {}, rollouts_of_table(table), metrics_in(table.column_names)), len(cells), damage, False)

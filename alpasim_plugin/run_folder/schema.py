@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -92,6 +93,7 @@ class Column:
         kind: Its type: text, integer (64 bits), number (double) or flag (boolean).
         is_required: A table without it, and a row without a value in it, is refused.
         least: The least value; None: any.
+        most: The greatest value; infinite: any.
         of_logs: Only tables of scored logs have it.
     """
 
@@ -99,6 +101,7 @@ class Column:
     kind: Kind
     is_required: bool = False
     least: float | None = None
+    most: float = math.inf
     of_logs: bool = False
 
 
@@ -132,10 +135,11 @@ class TableSchema:
         own = [column for column in self.columns if of_logs or not column.of_logs]
         return pa.schema([(column.name, types[column.kind]) for column in (*own, *columns_of(metrics))])
 
-    def check(self, path: Path, doing: str = DOING, do_this: str = AGAIN) -> list[str]:
+    def check(self, path: Path, doing: str = DOING, do_this: str = AGAIN, rates: Container[str] = ()) -> list[str]:
         """Compare a file with the schema before any of it is used, and return the names of its columns.
 
-        Types are read from the header; so are missing values and values out of range, where the header has statistics.
+        Types are read from the header; so are missing values and values out of range, where the header has statistics. Metrics that are
+        ``rates`` lie in [0, 1].
 
         Raises:
             InputError: It is no such table: the error names the file, the column, and the first row that is wrong.
@@ -143,7 +147,7 @@ class TableSchema:
         import pyarrow.parquet as pq
 
         names = check_parquet(path, doing, self.required, do_this)
-        stated = [*(c for c in self.columns if c.name in names), *columns_of(metrics_in(names))]
+        stated = [*(c for c in self.columns if c.name in names), *columns_of(metrics_in(names), rates)]
         with parsing(doing, path, do_this, "no readable parquet"):
             facts = pq.read_metadata(path)
             empty = pq.read_schema(path).empty_table()
@@ -161,9 +165,10 @@ class TableSchema:
         return read_parquet(path, doing, {name: kinds[name] for name in wanted if name in kinds}, do_this, only=only is not None)
 
 
-def columns_of(metrics: Iterable[str]) -> list[Column]:
+def columns_of(metrics: Iterable[str], rates: Container[str] = ()) -> list[Column]:
     """Return the columns of metrics: a number, and a flag that tells whether it is valid; null where a rollout failed."""
-    return [column for name in metrics for column in (Column(name, "number"), Column(name + VALID, "flag"))]
+    ranges = {name: {"least": 0.0, "most": 1.0} if name in rates else {} for name in metrics}
+    return [c for name, at in ranges.items() for c in (Column(name, "number", **at), Column(name + VALID, "flag"))]
 
 
 def metrics_in(columns: Iterable[str]) -> tuple[str, ...]:
@@ -217,7 +222,7 @@ def _is_suspicious(facts: Any, column: Column) -> bool:
         stats = facts.row_group(group).column(at).statistics
         if stats is None or not stats.has_null_count or (column.is_required and stats.null_count):
             return True
-        if column.least is not None and stats.has_min_max and stats.min < column.least:
+        if column.least is not None and (not stats.has_min_max or not column.least <= stats.min <= stats.max <= column.most):
             return True
     return False
 
@@ -230,6 +235,7 @@ def _check_values(path: Path, column: Column, doing: str, do_this: str) -> None:
     checks = [(pc.is_null(values), f"nothing, wanted {column.kind}")] if column.is_required else []
     if column.least is not None:
         checks.append((pc.less(values, column.least), f"a value below {column.least:g}"))
+        checks.append((pc.greater(values, column.most), f"a value above {column.most:g}"))
     for wrong, found in checks:
         row = pc.index(wrong, True).as_py()
         if row >= 0:

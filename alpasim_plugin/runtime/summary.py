@@ -14,7 +14,7 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.run_folder.columns import AGAIN, DOING, RolloutTable
 from alpasim_plugin.run_folder.manifests import damaged_files, find_contents, read_run_json
-from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS, SUMMARY
+from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
 from alpasim_plugin.run_folder.writer import write_tables
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.provenance import fixers
@@ -214,6 +214,7 @@ def _info_of(run: Path) -> dict[str, Any]:
     damaged = None if contents is None else next((one for one in damaged_files(run, contents) if one.file == ROLLOUTS), None)
     if contents is None or damaged is not None:
         raise InputError(DOING, str(run), "the run is not finished" if damaged is None else str(damaged), AGAIN)
+    ROLLOUTS_TABLE.check(run / ROLLOUTS, DOING, AGAIN, MetricTable.of_run(info).rates)
     return info
 
 

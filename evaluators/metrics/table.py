@@ -83,6 +83,11 @@ class MetricTable(Mapping[str, MetricInfo]):
         """Give the metrics that a report leads with; the others are one click away."""
         return tuple(name for name, facts in self.items() if facts.is_headline)
 
+    @property
+    def rates(self) -> frozenset[str]:
+        """Give the metrics that lie in [0, 1], as means of zeros and ones."""
+        return frozenset(name for name, facts in self.items() if facts.is_flag)
+
     def ordered(self, names: Iterable[str]) -> list[str]:
         """Sort names: headline metrics, then the others of the table in its order, then those that it does not hold by name."""
         headline = self.headline

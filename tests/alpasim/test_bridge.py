@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +43,10 @@ assert not {"torch", "numba", "av", "alpasim_plugin"} & set(sys.modules), sys.mo
 sys.exit(code)
 """
 
+REPO = Path(__file__).resolve().parents[2]
+PAGE, SCENES = REPO / "docs" / "alpasim.md", REPO.parent / "shared" / "data" / "alpasim-golden" / "scenes"
+WIZARD = "SIMRUN_ALPASIM_PYTHON"
+
 
 @pytest.fixture(scope="module")
 def staged(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -69,7 +76,34 @@ def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged: Path) -
         assert len(preset["wizard"]["external_services"]["renderer"]) == 1
         assert preset["runtime"]["endpoints"]["physics"]["skip"]
         assert preset["runtime"]["simulation_config"]["physics_update_mode"] == "NONE"
+        assert preset["wizard"]["debug_flags"]["use_localhost"]
+        assert "driver" in preset["wizard"]["run_sim_services"]
     assert kinds == {"onefixer": "sensorsim", "onefixer_world_model": "video_model"}
+
+
+LINES = [shlex.split(line, comments=True) for line in re.findall(r"-m alpasim_wizard (.*)", PAGE.read_text().replace("\\\n", " "))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", LINES, ids=lambda words: " ".join(words[2:]))
+def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(staged: Path, tmp_path: Path, words: list[str]) -> None:
+    python = os.environ.get(WIZARD)
+    if python is None:
+        pytest.skip(f"needs {WIZARD}, a Python that has AlpaSim's wizard")
+    facts = staged / f"{building.PACKAGE}-0.dist-info"
+    facts.mkdir(exist_ok=True)
+    (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {building.PACKAGE}\nVersion: 0\n")
+    (facts / "entry_points.txt").write_text(f"[alpasim.configs]\nonefixer = {building.PACKAGE}.configs\n")
+    still = "wizard.run_method=NONE", "wizard.validate_mount_points=false", "scenes.scene_ids=null", f"scenes.local_usdz_dir={SCENES}"
+    command = [python, "-m", "alpasim_wizard", *words, *still, f"wizard.log_dir={tmp_path}"]
+    path = os.pathsep.join([str(staged), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=os.environ | {"PYTHONPATH": path})
+    assert done.returncode == 0, done.stderr[-2000:]
+    network = yaml.safe_load((tmp_path / "generated-network-config.yaml").read_text())
+    asked = yaml.safe_load((tmp_path / "generated-user-config-0.yaml").read_text())["endpoints"]
+    for name, service in network.items():
+        assert bool(service["endpoints"]) != asked[name].get("skip", False), name
+        assert all(one["address"].startswith("localhost:") for one in service["endpoints"])
 
 
 def test_the_client_asks_again_only_after_what_may_pass(upstream: Host, renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import socket
 import subprocess
 import threading
 import time
@@ -15,6 +16,7 @@ import grpc
 import numpy as np
 import pytest
 
+from alpasim_plugin.alpasim.server import hosting
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.cli.main import run_command
@@ -207,11 +209,47 @@ def test_only_callers_with_the_token_are_served_but_health_is_open(upstream: Hos
             assert Stub(channel, "Health").Check(health_pb2.HealthCheckRequest()).status == 1
 
 
-def test_tls_with_an_upstream_behind_tls_and_a_token(renderer: StandInRenderer, tmp_path: Path) -> None:
-    key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return a key and a certificate that signs itself."""
+    key, cert = (tmp_path_factory.mktemp("tls") / name for name in ("key.pem", "cert.pem"))
     made = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
     extra = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1", "-keyout", str(key), "-out", str(cert)]
     subprocess.run([*made, *extra], check=True, capture_output=True)
+    return key, cert
+
+
+HELLO = bytes.fromhex("1603010200010001fc0303")  # a TLS client's first bytes, of more that never come
+
+
+@pytest.mark.parametrize("with_tls", [True, False], ids=["tls", "plain"])
+def test_handshakes_that_never_end_hold_nobody_up_and_are_ended(
+    pair: tuple[Path, Path], renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch, with_tls: bool
+) -> None:
+    monkeypatch.setattr(hosting, "HANDSHAKE_S", 1.0)
+    key, cert = pair
+    ways = grpc.insecure_channel, lambda address: grpc.secure_channel(address, grpc.ssl_channel_credentials(cert.read_bytes()))
+    right, wrong = ways[with_tls], ways[not with_tls]
+    with contextlib.ExitStack() as stack:
+        policy = HostPolicy(cert, key) if with_tls else HostPolicy()
+        host = stack.enter_context(hosted({"SensorsimService": renderer}, policy=policy))
+        place = host.address.rpartition(":")
+        opened = [stack.enter_context(socket.create_connection((place[0], int(place[2])))) for _ in range(90)]
+        for i, one in enumerate(opened):
+            one.sendall((b"", HELLO, b"GET / HTTP/1.1\r\n\r\n")[i % 3])
+        with wrong(host.address) as channel:
+            assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
+        with right(host.address) as channel:
+            assert Stub(channel, "SensorsimService").get_version(EMPTY, timeout=20)
+        for one in opened:
+            one.settimeout(20.0)
+            with contextlib.suppress(ConnectionResetError):
+                while one.recv(4096):
+                    pass
+
+
+def test_tls_with_an_upstream_behind_tls_and_a_token(pair: tuple[Path, Path], renderer: StandInRenderer, tmp_path: Path) -> None:
+    key, cert = pair
     (tmp_path / "token").write_text("secret")
     with hosted({"SensorsimService": renderer}, policy=HostPolicy(cert, key, token_file=tmp_path / "token")) as behind:
         service = assemble(Settings(renderer="identity", upstream=Upstream(behind.address, cert, "secret")))

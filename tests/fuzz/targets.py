@@ -142,8 +142,10 @@ def _inside_zip(data: bytes, rng: random.Random) -> bytes:
 
 REPORT = ("run.json", "summary.json", "rollouts.parquet", "steps.parquet", "scenes/*.json", "manifest.json", "*.jsonl", "*.asl")
 # Eight of nine are quick: a report takes as long as ten of the others.
-QUICK = (("compare", "@/run"), ("gate", "@/run"), ("aggregate", "@/run", "--all"), ("check", "@/run"), ("runs", "@/run"),
-         ("export", "@/run", "--alpasim", "@/out"), ("export", "@/run", "--scene", "plain", "--seed", "0", "--mcap", "@/a.mcap"))  # fmt: skip
+QUICK = (
+    ("compare", "@/run"), ("gate", "@/run"), ("aggregate", "@/run", "--all"), ("check", "@/run"), ("runs", "@/run"),
+    ("export", "@/run", "--alpasim", "@/out"), ("export", "@/run", "--scene", "plain", "--seed", "0", "--mcap", "@/a.mcap"),
+)  # fmt: skip
 TOGETHER = (("report", "@/run"), *QUICK, ("compare", "@/run", "--all"), ("gate", "@/run", "--json"))
 CORE: tuple[Target, ...] = (
     Target("scenario", make_scene_file("smoke/lead_car.yaml"), one_of("*.yaml", drive)),

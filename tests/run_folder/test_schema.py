@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -12,9 +13,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.checksums import SEAL
 from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.manifests import write_manifest
 from alpasim_plugin.run_folder.schema import ROLLOUT_FILES, ROLLOUTS_TABLE, RUN_FILES, STEPS_TABLE, TableSchema, cell_name, rollout_folder
-from evaluators.opening import read_run
+from alpasim_plugin.runtime.summary import aggregate_runs
+from evaluators.opening import read_run, read_so_far
+from tests.io.checksum_files import vouch_for
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 ROW = {"renderer": "clean", "policy": "p", "scene": "s", "seed": 0, "status": "ok", "path": "rollouts/x", "wall_s": 1.0, "frames": 3}
@@ -59,6 +64,27 @@ def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_ro
         assert caught.value.with_what == f"{path}{where}"
         assert found in caught.value.found
         assert caught.value.do_this
+
+
+@pytest.mark.parametrize("value", [-1e308, 1.5])
+def test_a_rate_outside_its_range_is_refused_by_row(tmp_path: Path, usual_run: Path, value: float) -> None:
+    run = shutil.copytree(usual_run, tmp_path / "run")
+    pq.write_table(changed("offroad", value), run / "rollouts.parquet")
+    vouch_for(run)
+    for read in (read_run, lambda folder: aggregate_runs([folder])):
+        with pytest.raises(InputError, match=r"column 'offroad': a value (below 0|above 1)") as caught:
+            read(run)
+        assert caught.value.with_what == f"{run / 'rollouts.parquet'}, row 2"
+
+
+def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(tmp_path: Path, usual_run: Path) -> None:
+    run = vouch_for(shutil.copytree(usual_run, tmp_path / "run"))
+    (run / "contents.json").unlink()
+    for path in run.rglob("manifest.json"):
+        held = json.loads(path.read_text())
+        write_manifest(path.parent, {key: value for key, value in held.items() if key not in (SEAL, "wall_s")})
+    with pytest.raises(InputError, match="manifests from which no table can be made"):
+        read_so_far(run)
 
 
 def test_steps_without_their_time_are_refused_by_row(tmp_path: Path, usual_run: Path) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from alpasim_plugin.alpasim.server.status import UnknownScene
+from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
@@ -148,7 +148,7 @@ class SceneCache:
         self._session = {"seed": seed, "device": device, "threads": threads}
         self._sources: dict[str, str | Path] = {}
         self._loaded: OrderedDict[str, SceneEntry] = OrderedDict()
-        self._lock = threading.Lock()
+        self._lock, self._loading = threading.Lock(), threading.Lock()
         for place in places:
             for source in sources_in(place):
                 self._enter(source)
@@ -163,24 +163,39 @@ class SceneCache:
         """Ids of the scenes that are loaded, the least recently used first."""
         return list(self._loaded)
 
-    def get(self, scene_id: str) -> SceneEntry:
-        """Return a scene, loaded if it is not; one is loaded at a time.
+    def get(self, scene_id: str, left: CallTime = CallTime()) -> SceneEntry:
+        """Return a scene, loaded if it is not. One is loaded at a time, and whoever asks for a loaded one does not wait for that.
 
         Raises:
             UnknownScene: No scene has that id.
             InputError: It cannot be read or built.
+            Late: The call's time is over.
         """
+        found = self._found(scene_id)
+        if found is not None:
+            return found
+        with left.holding(self._loading):
+            found = self._found(scene_id)  # another call may have loaded it meanwhile
+            if found is None:
+                found = self._load(self._sources[scene_id])
+                with self._lock:
+                    self._loaded[scene_id] = found
+                    while len(self._loaded) > self.kept:
+                        self._loaded.popitem(last=False)
+            return found
+
+    def _found(self, scene_id: str) -> SceneEntry | None:
+        """Return a scene if it is loaded, which is used by that."""
         with self._lock:
-            if scene_id not in self._loaded:
-                if scene_id not in self._sources:
-                    some = ", ".join(self.ids[:5]) + (" ..." if len(self._sources) > 5 else "")
-                    found = f"it is none of the {len(self._sources)} known: {some}"
-                    raise UnknownScene(DOING, f"scene {scene_id!r}", found, "add its file to --scenes")
-                self._loaded[scene_id] = self._load(self._sources[scene_id])
-                while len(self._loaded) > self.kept:
-                    self._loaded.popitem(last=False)
-            self._loaded.move_to_end(scene_id)
-            return self._loaded[scene_id]
+            if scene_id in self._loaded:
+                self._loaded.move_to_end(scene_id)
+                return self._loaded[scene_id]
+        if scene_id not in self._sources:
+            some = ", ".join(self.ids[:5]) + (" ..." if len(self._sources) > 5 else "")
+            raise UnknownScene(
+                DOING, f"scene {scene_id!r}", f"it is none of the {len(self._sources)} known: {some}", "add its file to --scenes"
+            )
+        return None
 
     def _load(self, source: str | Path) -> SceneEntry:
         scenario = load_scenario(source)

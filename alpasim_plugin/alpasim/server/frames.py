@@ -12,7 +12,7 @@ from alpasim_plugin.alpasim.server.caches import FixerCache, size_of
 from alpasim_plugin.alpasim.server.history import HistoryTree, Node
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import View, read_view
+from alpasim_plugin.alpasim.server.views import MAX_PIXELS, View, read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.images import ImageEncoding, encode_image
@@ -21,6 +21,7 @@ from alpasim_plugin.wire import sensorsim_pb2
 DOING = "answering a render request"
 ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}
 NODE_BYTES, OBJECT_BYTES = 4096, 512  # what a frame and each of its objects hold beside pictures and tensors, roughly
+MOST_PIXELS = 2 * MAX_PIXELS  # of all frames of a call: four cameras of 3840 x 2160, which are held until the last is done
 QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
 
 
@@ -57,6 +58,8 @@ class FrameServer:
         """
         forms = [image_form(request) for request in requests]
         views = [read_view(request) for request in requests]
+        if (pixels := sum(view.width * view.height for view in views)) > MOST_PIXELS:
+            raise InputError(DOING, f"{len(views)} frames", f"{pixels} pixels", f"ask for at most {MOST_PIXELS} in one call")
         if self._fixers is None:
             rendered = self.source.render(requests, views, left)
             return [encode(item.frame.rgb, form) for item, form in zip(rendered, forms, strict=True)]

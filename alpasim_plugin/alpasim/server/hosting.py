@@ -26,6 +26,7 @@ from alpasim_plugin.wire.services import OPTIONS, Reflection, handlers
 DOING = "opening a port"
 CALLS = 512  # threads for calls that are worked on, or wait for that
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
+HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
 SESSIONS = 64  # sessions at a time
 UPKEEP_S = 2.0
 S = TypeVar("S")
@@ -201,7 +202,8 @@ class Host:
     ) -> None:
         self.health, self._gate = Health(services), Gate(read_token(policy.token_file), workers)
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does not retry. Calls wait instead.
-        options = [*OPTIONS, ("grpc.so_reuseport", 0), ("grpc.max_concurrent_streams", STREAMS)]
+        limits = ("grpc.max_concurrent_streams", STREAMS), ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_S))
+        options = [*OPTIONS, ("grpc.so_reuseport", 0), *limits]
         self._server = grpc.server(ThreadPoolExecutor(CALLS, thread_name_prefix="serve"), options=options, interceptors=(self._gate,))
         made = [handlers(name, service) for name, service in services.items()]
         self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers()))

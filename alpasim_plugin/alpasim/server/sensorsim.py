@@ -117,7 +117,7 @@ class Sensorsim(Failures):
     def prefetch_scene(self, request: sensorsim_pb2.ScenePrefetchRequest, context: Any) -> common_pb2.Empty:
         """Load and build a scene before its first frame is asked for; the call is forwarded to an upstream that implements it."""
         if self._scenes is not None:
-            self._scenes.get(request.scene_id)
+            self._scenes.get(request.scene_id, CallTime(context))
         if self._upstream is not None:
             try:
                 self._upstream.prefetch_scene(request, timeout=CallTime(context).left_s())
@@ -132,7 +132,8 @@ class Sensorsim(Failures):
         if self._upstream is not None:
             return self._pass("get_available_cameras", request, context, sensorsim_pb2.AvailableCamerasReturn)
         assert self._scenes is not None
-        return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(self._scenes.get(request.scene_id).scenario))
+        entry = self._scenes.get(request.scene_id, CallTime(context))
+        return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(entry.scenario))
 
     @answering
     def get_available_trajectories(
@@ -142,7 +143,8 @@ class Sensorsim(Failures):
         if self._upstream is not None:
             return self._pass("get_available_trajectories", request, context, sensorsim_pb2.AvailableTrajectoriesReturn)
         assert self._scenes is not None
-        recorded = wire_trajectory(self._scenes.get(request.scene_id).scenario.ego_log, f"recorded path of scene {request.scene_id!r}")
+        entry = self._scenes.get(request.scene_id, CallTime(context))
+        recorded = wire_trajectory(entry.scenario.ego_log, f"recorded path of scene {request.scene_id!r}")
         listed = sensorsim_pb2.AvailableTrajectoriesReturn.AvailableTrajectory(trajectory=recorded)
         return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[listed])
 

@@ -140,11 +140,12 @@ class LocalSource:
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
         lens = read_lens(request.camera_intrinsics, view.width, view.height)
-        entry = self._scenes.get(view.scene_id)
+        entry = self._scenes.get(view.scene_id, left)
         camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
         asked = RenderRequest(view.t_us, camera, view.T_world_camera, boxes_at(entry, view))
         with left.holding(self._busy):
             frame = entry.render(asked)
+            left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
             sdmap = drawn_map(entry, view, lens, camera, self._threads)
         return Rendered(lens.frame(frame), sdmap)
 
@@ -218,7 +219,7 @@ class UpstreamSource:
         alpha = trusted_opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
         sdmap = None
         if self._scenes is not None:
-            entry = self._scenes.get(view.scene_id)
+            entry = self._scenes.get(view.scene_id, left)
             lens = read_lens(without_windshield(request.camera_intrinsics), width, height)
             sdmap = drawn_map(entry, view, lens, lens.spec(view.camera, np.eye(4)), self._threads)
         return Rendered(Frame(view.t_us, view.camera, rgb, alpha), sdmap)
@@ -233,7 +234,7 @@ class UpstreamSource:
         if view.scene_id not in self._paths:
             forget_if_many(self._paths)
             if self._scenes is not None:
-                path = self._scenes.get(view.scene_id).scenario.ego_log.xyz
+                path = self._scenes.get(view.scene_id, left).scenario.ego_log.xyz
             else:
                 asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=view.scene_id)
                 listed = self._stub.get_available_trajectories(asked, timeout=left.left_s()).available_trajectories

@@ -114,7 +114,7 @@ class WorldModel(Failures):
             check_image(frame.data, f"{what}, its initial frame", DOING)
             lens = read_lens(spec, spec.resolution_w, spec.resolution_h)
             cameras.append((spec.logical_id, lens, lens.spec(spec.logical_id, read_pose(mount, what) @ FLU_FROM_CAMERA)))
-        self._scenes.get(scene_id)  # built now: a chunk has no deadline, but a rollout waits for it
+        self._scenes.get(scene_id, CallTime(context))  # built now: a chunk has no deadline, but a rollout waits for it
         session = Session(
             scene_id,
             request.random_seed,
@@ -153,7 +153,7 @@ class WorldModel(Failures):
         before = [*([] if session.end_us is None else [session.end_us]), *times[:-1]]
         if any(b >= t for b, t in zip(before, times[-len(before) :] if before else [], strict=True)):
             raise InputError(DOING, f"session of {session.scene_id!r}", f"times {times} after {session.end_us}", "give times that increase")
-        entry = self._scenes.get(session.scene_id)
+        entry = self._scenes.get(session.scene_id, left)
         rig = [read_pose(pose.pose, f"rig pose at {pose.timestamp_us} us") for pose in poses]
         boxes = boxes_by_time(entry, request.dynamic_state.actors, times)
         outputs, past = [], dict(session.past)
