@@ -35,7 +35,7 @@ from alpasim_plugin.nets.schedule import interpolant
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
-NEAR, AROUND = 0.04, 5  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
+NEAR, AROUND = 0.02, 5  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
 
@@ -61,7 +61,7 @@ class PixelObjectives:
     source: Literal["mixed", "noise", "render"] = "mixed"
     picture: float = 1.0
     grid: float = 0.01
-    choice: float = 0.02
+    choice: float = 0.05
 
     @property
     def in_pixels(self) -> bool:

@@ -33,8 +33,8 @@ SIDE = 16  # crops are multiples of it
 # Probability of each augmentation of an episode: played backward, every second frame, mirrored, photometric, class colours of the map.
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
-P_BETTER, BETTER = 0.25, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
-P_DRIVE = 0.3  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
+P_BETTER, BETTER = 0.15, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
+P_DRIVE = 0.4  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
 P_GREY = 0.06  # recordings without colour
 # A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
 # render is the truth, moved by a smooth field; where it doubles, the mean of two.
@@ -58,10 +58,10 @@ class StreamShares:
         InputError: A negative share, or shares that do not add up to one.
     """
 
-    pairs: float = 0.77
-    identity: float = 0.07
-    video: float = 0.07
-    damaged_video: float = 0.09
+    pairs: float = 0.83
+    identity: float = 0.06
+    video: float = 0.01
+    damaged_video: float = 0.10
 
     def __post_init__(self) -> None:
         values = [getattr(self, f.name) for f in fields(self)]
@@ -257,7 +257,8 @@ class TrainingStreams:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
         if episode.moved_px and kind == "pairs":
             render, opacity = _moved(target, episode, stream("training", self.seed, f"{episode.key}.moved")), np.ones_like(opacity)
-        render = render + np.float32(episode.better) * (target - render)
+        elif episode.sequence not in self.drives:  # a real fit is never exact where it looks so
+            render = render + np.float32(episode.better) * (target - render)
         drawn = episode.references, index, rows, columns
         recorded = pair_references(episode.sequence, *drawn) if kind in ("pairs", "identity") else video_references(clip, *drawn)
         references = _lit_references(recorded, episode)
