@@ -15,7 +15,7 @@ import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.statistics.paired import reach_of
-from evaluators.statistics.sequential import asymptotic, betting
+from evaluators.statistics.sequential import asymptotic, betting, group
 from evaluators.statistics.sequential.draws import Draws, independent
 from evaluators.statistics.sequential.line import Plan
 from evaluators.statistics.sequential.question import OPPOSITE, Look, MetricLook, MetricQuestion, Question
@@ -217,11 +217,16 @@ class _Seen:
         plan = replace(self.plan, alpha=self.plan.alpha / sharing)
         if self.question.method == "asymptotic":
             return asymptotic.log_evidence(draws, mean, plan, self.first_look)
+        if self.question.method != "betting":
+            return group.log_evidence(draws, mean, plan, self.question.method)
         return betting.log_capital(draws, mean, betting.bet_sizes(draws, mean, plan))
 
     def _bound(self, draws: Draws, sign: float) -> float | None:
-        if self.question.method == "asymptotic":
-            found = float(asymptotic.lower_bound(draws, self.plan, self.first_look))
+        if self.question.method != "betting":
+            if self.question.method == "asymptotic":
+                found = float(asymptotic.lower_bound(draws, self.plan, self.first_look))
+            else:
+                found = group.lower_bound(draws, self.plan, self.question.method)
             return found if np.isfinite(found) else None
         least, most = sorted(sign * bound for bound in self.question.harm_bounds)
         sizes = betting.bet_sizes(draws, sign * self.question.threshold, self.plan)
@@ -234,7 +239,7 @@ def _guard(asked: MetricQuestion, x: F64, draws: Draws) -> Draws | None:
     As for the verdicts of `compare`. Only for independent scenes; of a suite whose scenes run out, the mean becomes known.
     """
     reach = reach_of(asked.facts, asked.margin)
-    if asked.method == "betting" or asked.asked != "non-inferior" or not reach or np.any(draws.slope != 1.0):
+    if asked.method != "asymptotic" or asked.asked != "non-inferior" or not reach or np.any(draws.slope != 1.0):
         return None
     return independent(np.clip(x, -reach, reach), -reach, reach)
 
