@@ -214,7 +214,7 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
             families = interval((entry.get("families") or {}).get("ci95")) or ()
             reach = max(map(abs, (diff, *bounds, *families))) or 1.0
             at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *families)]
-            span = Span(at[0], at[1], at[2], *at[3:], zero=50.0)
+            span = Span(at[0], at[1], at[2], *(at[3:] or (None, None)), 50.0)
     p = finite(entry.get("p_value"))
     p_cell = missing(reason or "no test was made") if p is None else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
