@@ -1,7 +1,7 @@
 """How many contacts each preset sees in random passes, by the length of the step.
 
-Run: ``python docs/scripts/contact_sampling.py 300``. Ego and one road user drive straight on at 0 to 20 m/s in any two directions; after 4 s their
-centres are within 5 m. The truth is `strict` at steps of 20 ms.
+Run: ``python docs/scripts/contact_sampling.py 300``. Ego and one road user drive straight on at 0 to 20 m/s in any two directions; after
+4 s their centres are within 5 m. The truth is `strict` at steps of 20 ms.
 """
 
 from __future__ import annotations
