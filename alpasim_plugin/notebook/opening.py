@@ -275,7 +275,7 @@ def run_html(run: Run) -> str:
     lines = []
     for row in rows:
         label = " ".join(part for part in (row.name, row.unit, row.arrow) if part)
-        cells = [f"{cell.text} <small>{escape(cell.detail or cell.count)}</small>" for cell in row.cells[: len(names)]]
+        cells = [f"{cell.text} <small>{escape(cell.detail)}</small>" for cell in row.cells[: len(names)]]
         lines.append([escape(label), *cells])
     first = next((rollout for rollout in run.rollouts if run.file_of(rollout, "strip.jpg") is not None), None)
     preset = escape(str(run.summary.get("preset")))

@@ -16,6 +16,7 @@ from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.sides import Row
 from evaluators.metrics.outcomes import in_words, outcomes_of, told
+from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
@@ -62,7 +63,9 @@ def summary_md(run: Run) -> str:
     if rows:
         head = ["metric", *(f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
         body = [[metric_label(r.name, r.unit, r.arrow), *(cell_text(c) for c in r.cells)] for r in rows]
-        parts.append(f"\n### Results, preset {escape(str(run.summary.get('preset')))}\n\n{table(head, body)}\n{INTERVAL_NOTE}\n")
+        preset = str(run.summary.get("preset"))
+        note = INTERVAL_NOTE + (f" Contact {said[8:]}." if (said := contact_note(preset)) else "")
+        parts.append(f"\n### Results, preset {escape(preset)}\n\n{table(head, body)}\n{note}\n")
     pairs = tables.pair_rows(run.summary, run.table)
     if pairs:
         head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]

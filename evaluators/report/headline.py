@@ -88,7 +88,18 @@ def find(run: Run) -> Finding:
     ended = endings(run)
     if done == 0:
         return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run), ended)
-    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in pair_tables(run.summary))
+    compared = list(pair_tables(run.summary))
+    asked = {
+        (i, m): float(p)
+        for i, (_, pairs) in enumerate(compared)
+        for m in _lead(run, pairs)
+        if (p := finite(pairs[m].get("p_value"))) is not None
+    }
+    shown = holm(asked)
+    points = tuple(
+        _paired_point(run, variant, pairs, frozenset(m for j, m in asked if i == j and (j, m) not in shown))
+        for i, (variant, pairs) in enumerate(compared)
+    )
     if points:
         title = "; ".join(_clause(run, point) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
@@ -162,13 +173,34 @@ def _listing(run: Run, metrics: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
-def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
-    stats = run.summary.get("metrics", {}).get(variant, {})
+def holm(p_values: Mapping[Any, float], alpha: float = 0.05) -> frozenset[Any]:
+    """Return which of several questions are answered when all share one alpha (Holm, Scandinavian Journal of Statistics 6, 1979).
+
+    >>> sorted(holm({"a": 0.01, "b": 0.02, "c": 0.2}))
+    ['a', 'b']
+    """
+    found: set[Any] = set()
+    for k, (name, p) in enumerate(sorted(p_values.items(), key=lambda one: one[1])):
+        if p > alpha / (len(p_values) - k):
+            break
+        found.add(name)
+    return frozenset(found)
+
+
+def _lead(run: Run, pairs: Mapping[str, Any]) -> list[str]:
+    """Return the differences that the headline asks for."""
     lead = [m for m in run.table.headline if m in pairs and finite(pairs[m].get("diff")) is not None]
     if "collision_at_fault" in lead and "collision_any" in lead:
         lead.remove("collision_any")
-    lead = lead or [m for m in run.table.ordered(pairs) if finite(pairs[m].get("diff")) is not None]
+    return lead or [m for m in run.table.ordered(pairs) if finite(pairs[m].get("diff")) is not None]
+
+
+def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any], chance: frozenset[str]) -> Point:
+    """Describe one comparison; what may be chance among so many questions is called undecided."""
+    stats = run.summary.get("metrics", {}).get(variant, {})
+    lead = _lead(run, pairs)
     tones = {m: tone_of(pairs[m], str(stats.get(m, {}).get("direction", "none"))) for m in lead}
+    tones = {m: "unclear" if m in chance and tone in ("worse", "better") else tone for m, tone in tones.items()}
     said = [m for m in lead if tones[m] in ("worse", "better")]
     kinds = {tones[m] for m in said}
     tone: Tone = "mixed" if len(kinds) == 2 else next(iter(kinds)) if kinds else "unclear"

@@ -212,10 +212,10 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
             low, high = (fixed(v * scale, places, sign=True) for v in bounds)
             bounds_cell = Cell(f"{low} to {high}", note, sort=bounds[1] - bounds[0])
             families_said = families_text(entry, scale, places, unit).removeprefix("; ")
-            families = interval((entry.get("families") or {}).get("ci95")) or ()
-            reach = max(map(abs, (diff, *bounds, *families))) or 1.0
-            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *families)]
-            span = Span(at[0], at[1], at[2], *at[3:], zero=50.0)
+            families = interval((entry.get("families") or {}).get("ci95"))
+            reach = max(map(abs, (diff, *bounds, *(families or ())))) or 1.0
+            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *(families or ()))]
+            span = Span(at[0], at[1], at[2], at[3] if families else None, at[4] if families else None, 50.0)
     p = finite(entry.get("p_value"))
     p_cell = missing(reason or "no test was made") if p is None else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)

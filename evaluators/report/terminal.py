@@ -15,6 +15,7 @@ from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.metrics.outcomes import outcomes_of
+from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run
 from evaluators.report.flips import find_flips, flip_bases
 from evaluators.report.headline import Finding, find
@@ -72,7 +73,8 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False, known:
     if headline_only and any(row.is_headline for row in rows):
         rows = [row for row in rows if row.is_headline]
     gaps = any("\u2014" in cell.text + cell.detail for row in rows for cell in row.cells)
-    note = MARGIN_NOTE + (GAP_NOTE if gaps else "") if rows else None
+    touch = contact_note(str(summary.get("preset"))) if any(row.name.startswith("collision") for row in rows) else ""
+    note = MARGIN_NOTE + (GAP_NOTE if gaps else "") + (f"\n{touch}" if touch else "") if rows else None
     table = Table(box=box.SIMPLE_HEAD, caption=note, caption_justify="left", pad_edge=False)
     table.add_column(Text(escape(f"preset {summary.get('preset', '?')}"), style="dim"), overflow="fold")
     for variant, entries in (summary.get("metrics") or {}).items():

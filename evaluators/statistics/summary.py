@@ -134,9 +134,10 @@ def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, di
         RENDERER -> ``rollouts`` (planned), ``failed`` (by failure class), ``dropped`` (by reason), the step counts of the ledger summed
         over rollouts, ``frames`` (rendered in rollouts that ran to their end), ``frame_events`` (by kind: ``black``, ``fixer-nan``, ...),
         ``frames_passed_raw`` (the fixer's guard took the raw frame), ``invalid`` (METRIC -> number of rollouts and their reasons), and for
-        every rate METRIC -> [least, greatest]: ``bounds_rollouts`` (every missing rollout without, and with, the event) and ``bounds``
-        (also every step that was cut from a scored rollout without, and with, the event), with ``cut`` (METRIC -> rollouts that were cut
-        before the event was seen).
+        every rate METRIC -> [least, greatest]: ``bounds_rollouts`` (every missing rollout without, and with, the event),
+        ``bounds_rollouts_ci95`` (the same with sampling error: the low end of the 95 % interval over scenes of the one, the high end of
+        the other; None with one scene) and ``bounds`` (also every step that was cut from a scored rollout without, and with, the event),
+        with ``cut`` (METRIC -> rollouts that were cut before the event was seen).
     """
     names = metric_names(rows)
     return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
@@ -159,6 +160,7 @@ def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -
         "invalid": {},
         "bounds": {},
         "bounds_rollouts": {},
+        "bounds_rollouts_ci95": {},
         "cut": {},
     }
     steps = [row.get("censored") or {} for row in side.rows]
@@ -174,6 +176,8 @@ def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -
         if metric.is_flag:
             is_share = metric.aggregation == "mean"
             out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(values, cut, scored, is_share)
+            ends = [clustered(np.where(np.isfinite(values), values, fill), side.scene[side.cell], True) for fill in (0.0, 1.0)]
+            out["bounds_rollouts_ci95"][name] = [ends[0].low, ends[1].high]
     return out
 
 
@@ -241,8 +245,8 @@ def numbers(
     arm_pairs = [] if by_policy_base is None else by_policy_base.pairs(arms)
     across = paired_arms(table, arm_pairs, known)
     for arm, other in arm_pairs:
-        here, there = table.sides(arm.policy)[arm.renderer], table.sides(other.policy, arm.policy)[other.renderer]
-        _add_families(across[arm.name], here, there, family_of, known)
+        pair = table.sides(arm.policy)[arm.renderer], table.sides(other.policy, arm.policy)[other.renderer]
+        _add_families(across[arm.name], *pair, family_of, known)
     return {name: by_policy(part, dict) for name, part in parts.items()} | {"paired_arms": across}
 
 

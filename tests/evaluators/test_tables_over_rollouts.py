@@ -230,9 +230,23 @@ def test_the_ledger_counts_every_cause_and_bounds_every_rate():
     assert (found["steps_total"], found["steps_warmup"], found["steps_after_event"], found["steps_scored"]) == (40, 8, 12, 20)
     assert found["invalid"]["offroad"] == {"rollouts": 1, "reasons": {"not given": 1}}
     assert found["bounds_rollouts"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(3 / 5)]
+    low, high = found["bounds_rollouts_ci95"]["offroad"]
+    assert low < 1 / 5 < 3 / 5 < high
     # Two rollouts without the event lost their last three steps: it may have happened there.
     assert found["bounds"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(5 / 5)]
     assert found["cut"]["offroad"] == 2
+
+
+def test_bounds_with_sampling_error_hold_the_rate_where_crashes_hide_events():
+    """Half of the rollouts with an event crash; the truth is 20 %."""
+    rng, held = np.random.default_rng(6), 0
+    for _ in range(100):
+        had = (rng.random(40) < 0.2).astype(float)
+        gone = (had > 0) & (rng.random(40) < 0.5)
+        rows = rows_of([[None if lost else value] for lost, value in zip(gone, had, strict=True)], "offroad")
+        low, high = censoring(rows)["3dgs"]["bounds_rollouts_ci95"]["offroad"]
+        held += low <= 0.2 <= high
+    assert held >= 93
 
 
 def test_a_dropped_rollout_is_listed_with_its_reason():

@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, Bool
-from evaluators.statistics.sequential import asymptotic, betting
+from evaluators.statistics.paired import reach_of
+from evaluators.statistics.sequential import asymptotic, betting, group
 from evaluators.statistics.sequential.draws import Draws, independent
 from evaluators.statistics.sequential.line import Plan
 from evaluators.statistics.sequential.question import OPPOSITE, Look, MetricLook, MetricQuestion, Question
@@ -110,7 +111,8 @@ def state_after(
         draws = (adjusted or {}).get(one.metric) or independent(x[known], *one.harm_bounds)
         is_whole = question.population == "suite" and n == (size or horizon) and len(known) == n
         plan = Plan(one.distance, horizon, question.alpha)
-        seen.append(_Seen(one, draws, plan, len(question.metrics), question.first_look, x if is_whole else None))
+        guard = _guard(one, x[known], draws)
+        seen.append(_Seen(one, draws, plan, len(question.metrics), question.first_look, x if is_whole else None, guard))
         paths = seen[-1].paths() if len(known) else (np.empty(0), np.empty(0))
         good.append(_hold(paths[0], known, n))
         bad.append(_hold(paths[1], known, n))
@@ -179,6 +181,7 @@ class _Seen:
     sharing: int  # metrics of which one is enough for the bad answer: its evidence is averaged over them
     first_look: int
     whole: F64 | None = None  # the differences of a suite all of whose scenes are driven: its mean is known
+    guard: Draws | None = None  # the differences cut to `reach_of`: "non-inferior" must hold for these by betting too
 
     def paths(self) -> tuple[F64, F64]:
         """Return the log e-processes ``(n,)`` for the good and for the bad answer."""
@@ -192,7 +195,11 @@ class _Seen:
     def _estimated(self) -> tuple[F64, F64]:
         at, mirror = self.question.threshold, self.draws.mirrored()
         if self.question.direction != "none":
-            return self._above(mirror, -at, 1), self._above(self.draws, at, self.sharing)
+            good = self._above(mirror, -at, 1)
+            if self.guard is not None:
+                bets = betting.bet_sizes(self.guard.mirrored(), -at, self.plan)
+                good = np.minimum(np.maximum.accumulate(good), np.maximum.accumulate(betting.log_capital(self.guard.mirrored(), -at, bets)))
+            return good, self._above(self.draws, at, self.sharing)
         # A change to either side counts: the size is within the margin if both ends are, and beyond it if either is.
         below, low_above = self._above(mirror, -at, 1), self._above(self.draws, -at, 1)
         above, low_below = self._above(self.draws, at, 2 * self.sharing), self._above(mirror, at, 2 * self.sharing)
@@ -210,15 +217,31 @@ class _Seen:
         plan = replace(self.plan, alpha=self.plan.alpha / sharing)
         if self.question.method == "asymptotic":
             return asymptotic.log_evidence(draws, mean, plan, self.first_look)
+        if self.question.method != "betting":
+            return group.log_evidence(draws, mean, plan, self.question.method)
         return betting.log_capital(draws, mean, betting.bet_sizes(draws, mean, plan))
 
     def _bound(self, draws: Draws, sign: float) -> float | None:
-        if self.question.method == "asymptotic":
-            found = float(asymptotic.lower_bound(draws, self.plan, self.first_look))
+        if self.question.method != "betting":
+            if self.question.method == "asymptotic":
+                found = float(asymptotic.lower_bound(draws, self.plan, self.first_look))
+            else:
+                found = group.lower_bound(draws, self.plan, self.question.method)
             return found if np.isfinite(found) else None
         least, most = sorted(sign * bound for bound in self.question.harm_bounds)
         sizes = betting.bet_sizes(draws, sign * self.question.threshold, self.plan)
         return float(betting.lower_bound(draws, sizes, self.plan.log_bar, least, most))
+
+
+def _guard(asked: MetricQuestion, x: F64, draws: Draws) -> Draws | None:
+    """Return the differences cut to how much worse a scene can be, where nothing else bounds them: scenes that look alike hide no tail.
+
+    As for the verdicts of `compare`. Only for independent scenes; of a suite whose scenes run out, the mean becomes known.
+    """
+    reach = reach_of(asked.facts, asked.margin)
+    if asked.method != "asymptotic" or asked.asked != "non-inferior" or not reach or np.any(draws.slope != 1.0):
+        return None
+    return independent(np.clip(x, -reach, reach), -reach, reach)
 
 
 def _hold(path: F64, at: I64, n: int) -> F64:

@@ -18,7 +18,7 @@ from evaluators.metrics import METRICS
 from evaluators.statistics.sequential.asymptotic import FIRST_LOOK
 
 Asked = Literal["non-inferior", "better"]
-Method = Literal["betting", "asymptotic"]
+Method = Literal["betting", "asymptotic", "obrien-fleming", "pocock"]
 Population = Literal["scenes", "suite"]
 Order = Literal["random", "stratified"]
 
@@ -27,6 +27,8 @@ OPPOSITE: dict[str, str] = {"non-inferior": "worse", "better": "not better"}
 METHOD_NAMES: dict[str, str] = {
     "betting": "betting, holds for every number of scenes",
     "asymptotic": "asymptotic: approximate, as a t interval is",
+    "obrien-fleming": "five looks, alpha spent as by O'Brien and Fleming: approximate, and wrong where few scenes are far worse",
+    "pocock": "five looks, alpha spent as by Pocock: approximate, and wrong where few scenes are far worse",
 }
 
 
