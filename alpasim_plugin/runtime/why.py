@@ -208,7 +208,7 @@ def _about_pictures(findings: Findings, start_us: int) -> list[tuple[str, str]]:
     """Say whether, when and how late plans react to pictures."""
     blind = next((one for one in findings.depends if "picture" in one.what and not one.is_used), None)
     if blind is not None:
-        return [("shown", "its plans do not depend on the pictures: grey ones give the same plans. It is blind.")]
+        return [("shown", "its plans do not depend on the pictures: whatever is done to them, the plans are the same. It is blind.")]
     late = [one.after_us for one in findings.pulses if one.after_us]
     deaf = [one for one in findings.pulses if one.after_us is None]
     heard = [one for one in findings.pulses if one.after_us is not None]
