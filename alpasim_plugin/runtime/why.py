@@ -217,5 +217,6 @@ def _about_pictures(findings: Findings, start_us: int) -> list[tuple[str, str]]:
         out.append(("shown", f"its plans react to a picture {min(late) * 1e-6:.1f} s late."))
     if heard and deaf and min(one.t_us for one in deaf) > max(one.t_us for one in heard):
         first, last = ((t_us - start_us) * 1e-6 for t_us in (max(one.t_us for one in heard), min(one.t_us for one in deaf)))
-        out.append(("shown", f"between {first:.1f} and {last:.1f} s its plans stop to react to pictures, as if one were frozen."))
+        told = f"between {first:.1f} and {last:.1f} s its plans stop to react to pictures: one is frozen, or it finds nothing in them."
+        out.append(("seen", told))
     return out
