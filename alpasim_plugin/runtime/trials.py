@@ -16,10 +16,10 @@ from alpasim_plugin.core.types import F64, U8, CameraSpec, Observation, Plan, Ro
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.runtime.guards import checked_plan, reset_policy
 
-AHEAD_S = (1.0, 2.0, 3.0)  # where plans are compared
+AHEAD_S = (0.5, 1.0, 1.5)  # where plans are compared with the recording: what is driven of a plan is its beginning
 CHANGED_M = 0.05  # plans further apart than this, 2 s ahead, are not the same
 CAP_M = 10.0  # of one distance: a plan that is far off is wrong, not infinitely wrong
-BETTER = 0.95  # a change that leaves less than this share of the error is driven
+WORSE = 1.2  # a change that makes the error this much larger is not driven
 MOST_S = 120.0  # of all trials together; a slow policy gets fewer
 PULSES = (0.1, 0.4, 0.7)  # where pictures are disturbed, as shares of the drive before the failure
 
@@ -225,11 +225,13 @@ class Tried:
     Attributes:
         error_m: `error_m` of its plans; None where the policy could not answer.
         why_not: What the policy said then.
+        moved_m: Largest distance of its plans, 2 s ahead, from those without the change.
     """
 
     trial: Trial
     error_m: float | None
     why_not: str = ""
+    moved_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -284,9 +286,9 @@ class Findings:
     left_out: int = 0
 
     def promising(self, at_most: int) -> list[Tried]:
-        """Return the trials worth a drive."""
-        good = [one for one in self.tried if one.error_m is not None and one.error_m < BETTER * self.own_error_m]
-        return good[:at_most]
+        """Return the trials worth a drive, the best first: they change the plans, and not for much worse."""
+        moving = [one for one in self.tried if one.error_m is not None and one.moved_m > CHANGED_M]
+        return [one for one in moving if (one.error_m or 0.0) < WORSE * self.own_error_m][:at_most]
 
 
 GREY = pictures(lambda rgb, _: np.full_like(rgb, 128))
@@ -332,8 +334,9 @@ def investigate(
         except PolicyError as error:
             tried.append(Tried(trial, None, error.found))
             continue
-        tried.append(Tried(trial, error_m(plans, observations, recorded)))
-        seen_m = max(seen_m, float(apart_m(given, plans).max())) if trial.of_pictures else seen_m
+        moved_m = float(apart_m(given, plans).max())
+        tried.append(Tried(trial, error_m(plans, observations, recorded), moved_m=moved_m))
+        seen_m = max(seen_m, moved_m) if trial.of_pictures else seen_m
     tried.sort(key=lambda one: np.inf if one.error_m is None else one.error_m)
     depends = tuple(replace(one, apart_m=max(one.apart_m, seen_m)) if "pictures" in one.what else one for one in depends)
     return Findings(own, tuple(tried), depends, pulses, True, len(all_trials) - len(tried))

@@ -28,7 +28,7 @@ from evaluators.opening import Run
 from evaluators.report.flips import baseline_of
 
 DOING = "finding why a drive failed"
-MOST_DRIVES = 3
+MOST_DRIVES = 8
 SLOW_US = 150_000  # a policy that answers later than this has a latency of its own
 Say = Callable[[str], None]
 
