@@ -183,6 +183,7 @@ class LaneCamera(Policy):
     def _debug(self, lane: LaneState | None, route: F64 | None, blended: Blend) -> dict[str, Any]:
         mode = ("straight" if route is None else "route") if lane is None else ("lane" if lane.blind_m == 0 else "memory")
         out: dict[str, Any] = {"mode": mode, "route_weight": blended.route_weight, "route_leaves_m": blended.route_leaves_m}
+        out["line_path"] = blended.path.xy  # the page of causes draws it on the road
         if lane is not None:
             names = ("lane_offset_m", "lane_heading_rad", "lane_curvature_1pm", "lane_bend_1pm2", "lane_width_m")
             out.update({name: float(value) for name, value in zip(names, lane.mean, strict=True)})

@@ -16,10 +16,10 @@ from alpasim_plugin.core.types import F64, U8, CameraSpec, Observation, Plan, Ro
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.runtime.guards import checked_plan, reset_policy
 
-AHEAD_S = (1.0, 2.0, 3.0)  # where plans are compared
+AHEAD_S = (0.5, 1.0, 1.5)  # where plans are compared with the recording: what is driven of a plan is its beginning
 CHANGED_M = 0.05  # plans further apart than this, 2 s ahead, are not the same
 CAP_M = 10.0  # of one distance: a plan that is far off is wrong, not infinitely wrong
-BETTER = 0.75  # a change that leaves less than this share of the error is driven
+WORSE = 1.2  # a change that makes the error this much larger is not driven
 MOST_S = 120.0  # of all trials together; a slow policy gets fewer
 PULSES = (0.1, 0.4, 0.7)  # where pictures are disturbed, as shares of the drive before the failure
 
@@ -35,12 +35,14 @@ class Trial:
         name: What is changed, for a table.
         cause: What is wrong with the policy if the change mends it.
         see, answer: Change the observation, and the plan.
+        of_pictures: It changes the pictures.
     """
 
     name: str
     cause: str
     see: See = lambda observation: observation
     answer: Answer = lambda plan, _: plan
+    of_pictures: bool = False
 
 
 class Changed(Policy):
@@ -130,6 +132,11 @@ def _turned(xy: F64, yaw: F64, by_rad: float) -> tuple[F64, F64]:
 MIRROR = np.array([1.0, -1.0])
 
 
+def _seen(name: str, cause: str, see: See) -> Trial:
+    """Return a change of the pictures."""
+    return Trial(name, cause, see, of_pictures=True)
+
+
 def trials(camera_x_m: float) -> Iterator[Trial]:
     """Give the changes that are tried, with the fault that each would undo.
 
@@ -150,18 +157,18 @@ def trials(camera_x_m: float) -> Iterator[Trial]:
     if abs(camera_x_m) > 0.3:
         shift = moved(lambda p, a, _: (p + np.array([camera_x_m, 0.0]), a))
         yield Trial("plan counted from the camera", "its plan counts from the camera, not from the rear axle", answer=shift)
-    yield Trial("colours exchanged", "it exchanges red and blue of the picture", pictures(lambda rgb, _: rgb[..., ::-1].copy()))
-    yield Trial("picture mirrored", "it reads the picture mirrored", pictures(lambda rgb, _: rgb[:, ::-1].copy()))
-    yield Trial("picture upside down", "it reads the picture upside down", pictures(lambda rgb, _: rgb[::-1].copy()))
+    yield _seen("colours exchanged", "it exchanges red and blue of the picture", pictures(lambda rgb, _: rgb[..., ::-1].copy()))
+    yield _seen("picture mirrored", "it reads the picture mirrored", pictures(lambda rgb, _: rgb[:, ::-1].copy()))
+    yield _seen("picture upside down", "it reads the picture upside down", pictures(lambda rgb, _: rgb[::-1].copy()))
     for zoom in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0):
-        yield Trial(f"focal length x {zoom:g}", f"it takes the focal length for {zoom:g} times what it is", warped(zoom))
+        yield _seen(f"focal length x {zoom:g}", f"it takes the focal length for {zoom:g} times what it is", warped(zoom))
     for degrees in (-6.0, -3.0, 3.0, 6.0):
         side, slope = ("right", "down") if degrees > 0 else ("left", "up")
         by, rad = f"{abs(degrees):g} degrees", np.deg2rad(degrees)
-        yield Trial(f"camera turned {side} {by}", f"it takes the camera to look {by} further {side} than it does", warped(right_rad=rad))
-        yield Trial(f"camera turned {slope} {by}", f"it takes the camera to look {by} further {slope} than it does", warped(down_rad=rad))
+        yield _seen(f"camera turned {side} {by}", f"it takes the camera to look {by} further {side} than it does", warped(right_rad=rad))
+        yield _seen(f"camera turned {slope} {by}", f"it takes the camera to look {by} further {slope} than it does", warped(down_rad=rad))
     for factor in (0.5, 2.0):
-        yield Trial(f"brightness x {factor:g}", f"it expects pictures of {factor:g} times the brightness", brightness(factor))
+        yield _seen(f"brightness x {factor:g}", f"it expects pictures of {factor:g} times the brightness", brightness(factor))
     for factor in (3.6, 1 / 3.6):
         yield Trial(f"speed x {factor:.3g}", f"it takes its speed for {1 / factor:.2g} times what it is (unit)", speed(factor))
     yield Trial("route mirrored", "it reads the route with the wrong sign", route(lambda xyz: xyz * [1.0, -1.0, 1.0]))
@@ -218,11 +225,13 @@ class Tried:
     Attributes:
         error_m: `error_m` of its plans; None where the policy could not answer.
         why_not: What the policy said then.
+        moved_m: Largest distance of its plans, 2 s ahead, from those without the change.
     """
 
     trial: Trial
     error_m: float | None
     why_not: str = ""
+    moved_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -277,16 +286,16 @@ class Findings:
     left_out: int = 0
 
     def promising(self, at_most: int) -> list[Tried]:
-        """Return the trials worth a drive."""
-        good = [one for one in self.tried if one.error_m is not None and one.error_m < BETTER * self.own_error_m]
-        return good[:at_most]
+        """Return the trials worth a drive, the best first: they change the plans, and not for much worse."""
+        moving = [one for one in self.tried if one.error_m is not None and one.moved_m > CHANGED_M]
+        return [one for one in moving if (one.error_m or 0.0) < WORSE * self.own_error_m][:at_most]
 
 
 GREY = pictures(lambda rgb, _: np.full_like(rgb, 128))
 NEGATIVE = pictures(lambda rgb, _: 255 - rgb)
 NO_ROUTE = route(lambda xyz: np.full_like(xyz, np.nan))
 INPUTS: Sequence[tuple[str, See]] = (
-    ("pictures, all grey", GREY),
+    ("pictures, grey or changed", GREY),
     ("route, taken away", NO_ROUTE),
     ("speed, a fifth higher", speed(1.2)),
 )
@@ -316,7 +325,7 @@ def investigate(
     depends = tuple(found for what, see in INPUTS if (found := _dependence(what, lambda see=see: with_change(see), given)))  # type: ignore[misc]
     pulses = tuple(_pulses(make, given, observations, **reset)) if observations[0].frames else ()
     mount_x_m = max((float(c.T_rig_camera[0, 3]) for c in observations[0].cameras.values()), default=0.0)
-    all_trials, tried = list(trials(mount_x_m)), []
+    all_trials, tried, seen_m = list(trials(mount_x_m)), [], 0.0
     for trial in all_trials:
         if time.monotonic() - began > MOST_S:
             break
@@ -325,8 +334,11 @@ def investigate(
         except PolicyError as error:
             tried.append(Tried(trial, None, error.found))
             continue
-        tried.append(Tried(trial, error_m(plans, observations, recorded)))
+        moved_m = float(apart_m(given, plans).max())
+        tried.append(Tried(trial, error_m(plans, observations, recorded), moved_m=moved_m))
+        seen_m = max(seen_m, moved_m) if trial.of_pictures else seen_m
     tried.sort(key=lambda one: np.inf if one.error_m is None else one.error_m)
+    depends = tuple(replace(one, apart_m=max(one.apart_m, seen_m)) if "pictures" in one.what else one for one in depends)
     return Findings(own, tuple(tried), depends, pulses, True, len(all_trials) - len(tried))
 
 

@@ -28,7 +28,7 @@ from evaluators.opening import Run
 from evaluators.report.flips import baseline_of
 
 DOING = "finding why a drive failed"
-MOST_DRIVES = 3
+MOST_DRIVES = 8
 SLOW_US = 150_000  # a policy that answers later than this has a latency of its own
 Say = Callable[[str], None]
 
@@ -208,7 +208,7 @@ def _about_pictures(findings: Findings, start_us: int) -> list[tuple[str, str]]:
     """Say whether, when and how late plans react to pictures."""
     blind = next((one for one in findings.depends if "picture" in one.what and not one.is_used), None)
     if blind is not None:
-        return [("shown", "its plans do not depend on the pictures: grey ones give the same plans. It is blind.")]
+        return [("shown", "its plans do not depend on the pictures: whatever is done to them, the plans are the same. It is blind.")]
     late = [one.after_us for one in findings.pulses if one.after_us]
     deaf = [one for one in findings.pulses if one.after_us is None]
     heard = [one for one in findings.pulses if one.after_us is not None]
@@ -217,5 +217,6 @@ def _about_pictures(findings: Findings, start_us: int) -> list[tuple[str, str]]:
         out.append(("shown", f"its plans react to a picture {min(late) * 1e-6:.1f} s late."))
     if heard and deaf and min(one.t_us for one in deaf) > max(one.t_us for one in heard):
         first, last = ((t_us - start_us) * 1e-6 for t_us in (max(one.t_us for one in heard), min(one.t_us for one in deaf)))
-        out.append(("shown", f"between {first:.1f} and {last:.1f} s its plans stop to react to pictures, as if one were frozen."))
+        told = f"between {first:.1f} and {last:.1f} s its plans stop to react to pictures: one is frozen, or it finds nothing in them."
+        out.append(("seen", told))
     return out

@@ -64,7 +64,7 @@ def worst_pairs(check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence
         other = Arm(str(row["renderer"]), str(row["policy"]))
         if check.kind == "margin" and short_name(other, arm) == check.entry["baseline"]:
             was[str(row["scene"]), int(row["seed"])] = value_of(row, check.metric)
-    found = []
+    found: list[dict[str, Any]] = []
     for row in rows:
         key, now = (str(row["scene"]), int(row["seed"])), value_of(row, check.metric)
         before = was.get(key)
@@ -72,7 +72,7 @@ def worst_pairs(check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence
             continue
         worse = sign * (now - (before or 0.0))
         if worse > 0.0:
-            pair = {"scene": key[0], "seed": key[1], "was": before, "now": now, "worse": worse}
+            pair: dict[str, Any] = {"scene": key[0], "seed": key[1], "was": before, "now": now, "worse": worse}
             found.append(pair | {"metric": check.metric, "renderer": check.renderer, "policy": check.policy})
     return sorted(found, key=lambda pair: -pair["worse"])[:WORST]
 

@@ -71,10 +71,10 @@ class SwappedChannels(ByYellow):
 
 
 class WrongFocalLength(ByYellow):
-    """The focal length is believed to be 1.5 times what it is."""
+    """The focal length is believed to be 1.25 times what it is."""
 
     def __init__(self, scenario: Scenario) -> None:
-        super().__init__(_wrong_camera(scenario, lambda c: replace(c, K=c.K * np.array([[1.5, 1, 1], [1, 1.5, 1], [1, 1, 1]]))))
+        super().__init__(_wrong_camera(scenario, lambda c: replace(c, K=c.K * np.array([[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]]))))
 
 
 class FrozenFrame(LaneCamera):

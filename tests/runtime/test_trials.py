@@ -192,5 +192,5 @@ def test_a_plan_along_the_recording_has_no_error_and_one_beside_it_its_distance(
     seen, t = observed(0, 0.0, yaw=0.0), 1e-6 * TIMES
     plan = Plan(0, TIMES, np.stack([8.0 * t, 0 * t], axis=1), 0 * t)
     assert error_m([plan], [seen], straight) == pytest.approx(0.0, abs=1e-9)
-    assert error_m([replace(plan, xy=[*plan.xy, 0, 2.0])], [seen], straight) == pytest.approx(2.0)
+    assert error_m([replace(plan, xy=plan.xy + np.array([0, 2.0]))], [seen], straight) == pytest.approx(2.0)
     assert error_m([later(plan, 0.5)], [seen], straight) > 5.0
