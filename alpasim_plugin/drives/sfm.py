@@ -49,8 +49,8 @@ def read_unposed(path: Path, work: Path, tell: Report) -> SourceDrive:
         InputError: The extra is missing, the video is damaged, or fewer than half of the photographs can be registered.
     """
     if not (work / TIMES).is_file():
-        found = write_frames(path, work / FRAMES, tell)
-        write_json(work / TIMES, {"times": found.times, "middle": found.middle, "notes": found.notes})
+        frames = write_frames(path, work / FRAMES, tell)
+        write_json(work / TIMES, {"times": frames.times, "middle": frames.middle, "notes": frames.notes})
     kept: dict[str, Any] = read_json(work / TIMES, DOING)
     times, notes = kept["times"], list(kept["notes"])
     if model_folder(work) is None:
