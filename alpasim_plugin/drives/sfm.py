@@ -26,6 +26,7 @@ LENSES = {PLAIN: 0.8, "SIMPLE_RADIAL_FISHEYE": 0.5}  # tried, and their focal le
 FEATURES, OVERLAP = 2500, 5  # of a photograph; the next ones that it is matched with, and then the 8th, 16th, ...
 FAR, CLEARLY = 8, 1.05  # photographs between two by which lenses are told apart; by how much a wide one must explain more
 TURNS_RAD = np.radians(3.0)  # of a camera's axis from its mean, by which photographs tell the focal length
+LEAST_DEEP = 0.1  # of the pairs of photographs must show depth
 LEAST_SHARE = 0.5  # of the photographs that must be registered
 FRAMES, MODEL, TIMES, DATABASE = "images", "sparse/0", "times.json", "database.db"
 
@@ -48,8 +49,8 @@ def read_unposed(path: Path, work: Path, tell: Report) -> SourceDrive:
         InputError: The extra is missing, the video is damaged, or fewer than half of the photographs can be registered.
     """
     if not (work / TIMES).is_file():
-        found = write_frames(path, work / FRAMES, tell)
-        write_json(work / TIMES, {"times": found.times, "middle": found.middle, "notes": found.notes})
+        frames = write_frames(path, work / FRAMES, tell)
+        write_json(work / TIMES, {"times": frames.times, "middle": frames.middle, "notes": frames.notes})
     kept: dict[str, Any] = read_json(work / TIMES, DOING)
     times, notes = kept["times"], list(kept["notes"])
     if model_folder(work) is None:
@@ -91,10 +92,14 @@ def _register(path: Path, work: Path, middle: tuple[float, float], tell: Report)
     pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
     tell("registering photographs", 0, 1)
-    models = _mapped(work, middle, threads)
+    do = "give a part in which the car moves and the world stands, in daylight, or poses"
+    deep = _verified(work, middle, threads)
+    if deep < LEAST_DEEP:
+        found = f"{100 * deep:.0f} % of the pairs of photographs show depth: the camera only turns, or stands"
+        raise InputError(DOING, str(path), found, do)
+    models = _mapped(work, threads)
     if not models:
-        found = "no two photographs from which a model can begin"
-        raise InputError(DOING, str(path), found, "give a part in which the car moves and the world stands, in daylight, or poses")
+        raise InputError(DOING, str(path), "no two photographs from which a model can begin", do)
     target = work / "sparse" / "unfinished"
     target.mkdir(parents=True, exist_ok=True)
     best = max(models, key=lambda model: model.compute_num_observations())
@@ -103,20 +108,31 @@ def _register(path: Path, work: Path, middle: tuple[float, float], tell: Report)
     target.rename(work / MODEL)
 
 
-def _mapped(work: Path, middle: tuple[float, float], threads: int) -> list[Any]:
-    """Return the models that COLMAP finds."""
+def _verified(work: Path, middle: tuple[float, float], threads: int) -> float:
+    """Choose the lens, verify the matches by it, and return the share of pairs that no turn of the camera explains, nor one plane."""
     import pycolmap
 
     with pycolmap.Database.open(work / DATABASE) as database:
         camera = database.read_all_cameras()[0]
         if not camera.has_prior_focal_length:  # which a photograph's file may say
-            fits = {name: _fits(database, lens) for name, lens in _lenses(camera, middle).items()}
+            lenses = _lenses(camera, middle)
+            fits = {name: _fits(database, lens) for name, lens in lenses.items()}
             best = max(fits, key=lambda name: fits[name])
-            chosen = _lenses(camera, middle)[best if fits[best] > CLEARLY * fits[PLAIN] else PLAIN]
+            chosen = lenses[best if fits[best] > CLEARLY * fits[PLAIN] else PLAIN]
             chosen.has_prior_focal_length = chosen.model.name != PLAIN  # COLMAP asks for it of a lens that bends lines
             chosen.camera_id = camera.camera_id
             database.update_camera(chosen)
     pycolmap.geometric_verification(work / DATABASE, pycolmap.GeometricVerifierOptions(num_threads=threads))
+    with pycolmap.Database.open(work / DATABASE) as database:
+        kinds = [int(pair.config) for pair in database.read_two_view_geometries()[1]]
+    deep = [int(kind) for kind in (pycolmap.TwoViewGeometryConfiguration.CALIBRATED, pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)]
+    return float(np.isin(kinds, deep).mean()) if kinds else 0.0
+
+
+def _mapped(work: Path, threads: int) -> list[Any]:
+    """Return the models that COLMAP finds."""
+    import pycolmap
+
     options = pycolmap.IncrementalPipelineOptions(min_model_size=FEWEST, num_threads=threads, max_num_models=4)
     mapper = options.mapper
     mapper.init_max_forward_motion, mapper.init_min_tri_angle, mapper.init_min_num_inliers = 1.0, 2.0, 40

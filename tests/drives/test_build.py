@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives import build
 from alpasim_plugin.drives.build import import_drive
+from alpasim_plugin.drives.opening import read_source
+from alpasim_plugin.drives.placing import place
+from alpasim_plugin.drives.source import Points
 from alpasim_plugin.gaussians.fit.photographs import read_views
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
@@ -92,6 +96,23 @@ def test_scale_without_metres_comes_from_the_cameras_height(tmp_path: Path, quic
     assert quality["scale"] == "scale from the camera's height above the ground, 1.5 m (as given)"
     ego = load_scenario(tmp_path / "out/scenario.yaml").ego_log.xyz
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.03)
+
+
+def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(walk: Path, tmp_path: Path) -> None:
+    drive = read_source(walk, tmp_path, lambda stage, done, whole: None)
+    placed = place(replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3))))
+    shown = build.shown_photographs(drive, placed)
+    assert sum(one.use == "held-out" for one in shown) == 5
+    assert any("photographs taken along a road" in note for note in placed.notes)
+
+
+def test_views_are_half_as_wide_and_their_longer_side_is_not_small(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = read_source(walk, tmp_path, lambda stage, done, whole: None)
+    shown = build.Shown(drive.pictures[0], "front", "fitted", np.eye(4), "a.png", {})
+    monkeypatch.setattr(build, "FIT_PX", 200)
+    assert shown.view().rgb.shape == (80, 200, 3)  # of 320 x 128
+    monkeypatch.setattr(build, "FIT_PX", 100)
+    assert shown.view().rgb.shape == (64, 160, 3)
 
 
 def test_the_command_tells_what_it_found(tmp_path: Path, quick_fit: None, capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,6 +103,20 @@ def test_a_wide_lens_is_told_from_a_plain_one() -> None:
         assert (fits["SIMPLE_RADIAL_FISHEYE"] > CLEARLY * fits[PLAIN]) == (lens != PLAIN), fits
 
 
+def test_a_camera_that_only_turns_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
+    street, K = Street(), np.array([[FOCAL, 0, 163.0], [0, FOCAL, 54.0], [0, 0, 1]])
+    picture = street.photograph(street.pose(8.0))
+    folder = tmp_path / "turning"
+    folder.mkdir()
+    for i in range(8):
+        turn, _ = cv2.Rodrigues(np.array([0.0, 0.03 * (i - 4), 0.0]))
+        seen = cv2.warpPerspective(picture, K @ turn @ np.linalg.inv(K), (320, 128), flags=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{i}.png"), seen)
+    with pytest.raises(InputError, match="only turns"):
+        read_source(folder, tmp_path / "work", told)
+
+
 def test_a_video_that_shows_nothing_or_is_none_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "odd.mp4"
     path.write_bytes(b"\0" * 2000)
