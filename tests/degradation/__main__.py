@@ -1,7 +1,7 @@
 """Every verb on every machine that lacks something: ``python -m tests.degradation``; needs root, to become another user and to mount.
 
-``--machine`` and ``--verb`` take those whose name contains a word, or one of several with commas between. The table says the exit code of each cell; what ended otherwise than
-docs/cli.md says is printed below it, and makes the command end with 1.
+``--machine`` and ``--verb`` take those whose name contains a word, or one of several with commas between. The table says the exit code of
+each cell; what ended otherwise than docs/cli.md says is printed below it, and makes the command end with 1.
 """
 
 from __future__ import annotations
