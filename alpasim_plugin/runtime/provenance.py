@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypedDict
@@ -118,8 +119,8 @@ def _without(reason: str) -> Project:
 
 def _git(folder: Path | None, *words: str) -> str:
     """Return what git prints; its errors are raised."""
-    given = {"cwd": folder, "env": os.environ | ALONE, "timeout": PATIENCE_S}
-    return subprocess.run([*GIT, *words], capture_output=True, text=True, check=True, **given).stdout
+    asked = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=PATIENCE_S)
+    return str(asked([*GIT, *words], cwd=folder, env=os.environ | ALONE).stdout)
 
 
 def _no_filters(folder: Path | None) -> list[str]:
