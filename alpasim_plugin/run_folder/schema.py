@@ -167,8 +167,11 @@ class TableSchema:
 
 def columns_of(metrics: Iterable[str], rates: Container[str] = ()) -> list[Column]:
     """Return the columns of metrics: a number, and a flag that tells whether it is valid; null where a rollout failed."""
-    ranges = {name: {"least": 0.0, "most": 1.0} if name in rates else {} for name in metrics}
-    return [c for name, at in ranges.items() for c in (Column(name, "number", **at), Column(name + VALID, "flag"))]
+    out: list[Column] = []
+    for name in metrics:
+        least, most = (0.0, 1.0) if name in rates else (None, math.inf)
+        out += [Column(name, "number", least=least, most=most), Column(name + VALID, "flag")]
+    return out
 
 
 def metrics_in(columns: Iterable[str]) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypedDict
@@ -17,7 +18,10 @@ from alpasim_plugin import __version__
 PACKAGES = ("numpy", "scipy", "numba", "torch", "shapely", "opencv-contrib-python-headless", "pyarrow", "av")
 VARIABLE = "SIMRUN_COMMIT"
 PATIENCE_S = 5.0
-GIT = ("git", "--no-optional-locks", "-c", "core.fsmonitor=false")
+# The repository may be a stranger's: nothing that its configuration names may run, and nothing may be fetched.
+GIT = ("git", "--no-optional-locks", "-c", "core.fsmonitor=false", "-c", "log.showSignature=false", "-c", "core.hooksPath=/dev/null")
+STATUS = ("--porcelain=v2", "--branch", "--untracked-files=no", "--ignore-submodules=dirty")
+ALONE = {"GIT_ALLOW_PROTOCOL": "none", "GIT_NO_LAZY_FETCH": "1"}
 _COMMIT = re.compile(r"[0-9a-f]{7,64}")
 COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
 
@@ -62,7 +66,8 @@ class Project(TypedDict):
         commit: Full hash of the commit; None where there is none.
         committed_at: When it was made, ISO 8601.
         branch: None where no branch is checked out.
-        dirty: Whether a file that git follows differs from the commit; files that it does not follow do not count.
+        dirty: Whether a file that git follows differs from the commit; files that it does not follow do not count, nor do changes in
+            submodules.
         reason: Why there is no commit, else empty.
     """
 
@@ -89,7 +94,9 @@ def project(folder: Path | None = None) -> Project:
         return {"commit": stated, "committed_at": None, "branch": None, "dirty": None, "reason": ""}
     try:
         last = _git(folder, "log", "-1", "--format=%H %cI")
-        state = _git(folder, "status", "--porcelain=v2", "--branch", "--untracked-files=no")
+        state = _git(
+            folder, *_no_filters(folder), "status", "--porcelain=v2", "--branch", "--untracked-files=no", "--ignore-submodules=dirty"
+        )
     except FileNotFoundError:
         return _without("git is not installed")
     except subprocess.TimeoutExpired:
@@ -112,7 +119,26 @@ def _without(reason: str) -> Project:
 
 def _git(folder: Path | None, *words: str) -> str:
     """Return what git prints; its errors are raised."""
-    return subprocess.run([*GIT, *words], cwd=folder, capture_output=True, text=True, check=True, timeout=PATIENCE_S).stdout
+    asked = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=PATIENCE_S)
+    return str(asked([*GIT, *words], cwd=folder, env=os.environ | ALONE).stdout)
+
+
+def _no_filters(folder: Path | None) -> list[str]:
+    """Return the words that switch off what a repository's configuration runs on files: a filter's file then counts as it lies there.
+
+    Raises:
+        subprocess.CalledProcessError: A filter's name cannot be said on a command line.
+    """
+    words = ["config", "--name-only", "-z", "--get-regexp", r"^filter\..*\.(clean|process|required)$"]
+    try:
+        names = _git(folder, *words).split("\0")[:-1]
+    except subprocess.CalledProcessError as error:
+        if error.returncode != 1 or error.stderr:
+            raise
+        return []  # none is configured
+    if any("=" in name for name in names):
+        raise subprocess.CalledProcessError(1, words, stderr="a filter of its configuration has '=' in its name")
+    return [word for name in names for word in ("-c", f"{name}={'false' if name.endswith('.required') else ''}")]
 
 
 def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:

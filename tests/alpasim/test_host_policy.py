@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import grpc
@@ -15,10 +16,13 @@ import pytest
 
 from alpasim_plugin.alpasim.server import gate
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
+from alpasim_plugin.alpasim.server.caches import SceneCache
 from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService
+from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.alpasim.server.one_policy import _unknown_scene
-from alpasim_plugin.alpasim.server.views import read_lens, read_view
+from alpasim_plugin.alpasim.server.status import CallTime, Late
+from alpasim_plugin.alpasim.server.views import read_lens, read_view, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.log.images import encode_image
@@ -26,6 +30,7 @@ from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.wire.services import Stub, methods
 from tests.alpasim.service_cases import START_US, StandInRenderer, channel_to, hosted, pinhole, request
+from tests.alpasim.test_server_lenses import ftheta
 
 EMPTY = common_pb2.Empty()
 Code = grpc.StatusCode
@@ -44,7 +49,7 @@ class Cruise(Policy):
         pass
 
     def act(self, observation: Observation) -> Plan:
-        self.poses = len(observation.history)
+        self.poses, self.cameras, self.frames = len(observation.history), observation.cameras, observation.frames
         times = observation.t_us + 100_000 * np.arange(41)
         x = 10e-6 * (times - observation.t_us)
         return Plan(observation.t_us, times, np.stack([x, 0 * x], axis=1), 0 * x)
@@ -216,6 +221,30 @@ def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory() -> None:
     assert read_view(request(identity, identity, START_US, size=(3848, 2168))).width == 3848
 
 
+def test_frames_of_too_many_pixels_together_are_refused_before_any_is_made() -> None:
+    asked = [request(np.eye(4), np.eye(4), START_US + i, size=(4096, 2048)) for i in range(5)]
+    frames: Any = FrameServer(None, None, None, None)  # type: ignore[arg-type]  # nothing of it is reached
+    with pytest.raises(InputError, match="41943040 pixels"):
+        frames.answers(asked, CallTime())
+
+
+def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = SceneCache(["smoke/straight", "smoke/curve"], None, False)
+    loaded, other = scenes.ids
+    first, entered, leave = scenes.get(loaded), threading.Event(), threading.Event()
+    monkeypatch.setattr(scenes, "_load", lambda source: [entered.set(), leave.wait(30)])
+    loading = threading.Thread(target=scenes.get, args=(other,))
+    loading.start()
+    assert entered.wait(10)
+    assert scenes.get(loaded) is first
+    gone = SimpleNamespace(time_remaining=lambda: None, is_active=lambda: False)
+    with pytest.raises(Late):
+        scenes.get(other, CallTime(gone))
+    leave.set()
+    loading.join(10)
+    assert scenes.loaded == [loaded, other]
+
+
 # --- sessions of a driver -------------------------------------------------------------------------------------------------
 
 
@@ -226,8 +255,8 @@ def opening(name: str) -> egodriver_pb2.DriveSessionRequest:
     return request
 
 
-def seen(name: str, t_us: int) -> egodriver_pb2.RolloutCameraImage:
-    picture = encode_image(np.zeros((32, 48, 3), np.uint8))
+def seen(name: str, t_us: int, size: tuple[int, int] = (48, 32)) -> egodriver_pb2.RolloutCameraImage:
+    picture = encode_image(np.zeros((*size[::-1], 3), np.uint8))
     camera_image = {"logical_id": "front", "frame_end_us": t_us, "image_bytes": picture}
     return egodriver_pb2.RolloutCameraImage(session_uuid=name, camera_image=camera_image)
 
@@ -269,6 +298,23 @@ def test_a_sessions_past_has_an_end_and_so_have_the_times_that_are_kept() -> Non
         stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=3 * MOST_POSES))
     assert made[0].poses == MOST_POSES
     assert service.drives_s.maxlen is not None
+
+
+def test_a_policy_is_shown_the_pinhole_of_a_camera_with_an_f_theta_lens_and_one_size() -> None:
+    service, made = driver_service()
+    asked = opening("a")
+    asked.rollout_spec.vehicle.available_cameras[0].intrinsics.CopyFrom(ftheta(False))
+    with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
+        stub = Stub(channel, "EgodriverService")
+        stub.start_session(asked)
+        stub.submit_image_observation(seen("a", 1, (160, 90)))
+        stub.submit_egomotion_observation(moved("a", 1))
+        assert stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=1)).trajectory.poses
+        assert failure(lambda: stub.submit_image_observation(seen("a", 2, (320, 180))))[0] is Code.INVALID_ARGUMENT
+    (shown,) = made[0].cameras.values()
+    straight = straight_of(ftheta(False), 160, 90)
+    assert (shown.width, shown.height) == straight.size == made[0].frames["front"].rgb.shape[1::-1]
+    np.testing.assert_array_equal(shown.K, straight.K)
 
 
 def test_times_that_no_rollout_has_are_the_callers_fault() -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.views import Lens, read_lens
+from alpasim_plugin.alpasim.server.views import Lens, read_lens, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.wire import sensorsim_pb2
@@ -92,6 +92,27 @@ def test_each_direction_is_shown_where_the_lens_puts_it(spec: Spec, project: Cal
         assert 1 < pixel[0] < 319
         assert 1 < pixel[1] < 179
         np.testing.assert_allclose(shown_at(lens, pixel), ray, atol=2e-4)
+
+
+@pytest.mark.parametrize("size", [(320, 180), (640, 360)])
+@pytest.mark.parametrize(("spec", "project"), [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(False), by_ftheta)])
+def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
+    spec: Spec, project: Callable[[Spec], F64], size: tuple[int, int]
+) -> None:
+    straight = straight_of(spec, *size)
+    assert straight.place is not None
+    assert straight.size[0] == size[0]
+    for (x, y), pixel in zip(RAYS, project(spec) * size[0] / 320, strict=True):
+        column, row = straight.K[0] @ [x, y, 1] - 0.5, straight.K[1] @ [x, y, 1] - 0.5
+        found = cv2.remap(straight.place, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR)[0, 0]
+        np.testing.assert_allclose(found + 0.5, pixel, atol=0.05)
+
+
+def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black() -> None:
+    assert straight_of(pinhole(64, 32), 64, 32).place is None
+    picture = straight_of(ftheta(False), 320, 180).image(np.full((180, 320, 3), 200, np.uint8))
+    assert picture[0, 0].tolist() == [0, 0, 0]  # beyond the picture's curved edge
+    assert picture[picture.shape[0] // 2, 160].tolist() == [200, 200, 200]
 
 
 def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean() -> None:

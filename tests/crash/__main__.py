@@ -1,4 +1,4 @@
-"""Kill runs, start two at once, and fill the disk at every write; then finish them and compare with an undisturbed run.
+"""Kill runs, start two at once, and fill the disk at every write; then finish them and compare with an undisturbed run. Kill readers too.
 
     python -m tests.crash --kills 100 --seed 0
 
@@ -13,6 +13,7 @@ import os
 import random
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -31,6 +32,7 @@ TARGETS = ("parent", "worker", "both")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 PHASES = ("start", "building", "driving", "scoring", "reporting", "anywhere")
 GIVE_UP_S = 300.0
+READ_S = 4.0  # in which readers are killed
 
 
 @dataclass(frozen=True)
@@ -187,6 +189,26 @@ class Campaign:
                 found.append("the refusal names nobody")
             self._report(label, found + in_child(partial(problems_after_finish, root, self.expected, {})))
 
+    def readers(self, count: int, seed: int) -> None:
+        """Kill ``gate`` and ``serve`` at any time: the run stays as it was, nothing keeps running, and the port can be had again."""
+        stream, root = random.Random(seed), self.work / "undisturbed"
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        serve = ["serve", "--scenes", "smoke/straight", "--renderer", "clean", "--listen", f"127.0.0.1:{port}"]
+        for number in range(count):
+            arguments, signal_ = (["gate", str(root)], serve)[number % 2], stream.choice(SIGNALS)
+            driver, after_s = start(arguments, self._said()), stream.uniform(0.0, READ_S)
+            time.sleep(after_s)
+            if driver.poll() is None:
+                os.kill(driver.pid, signal_)
+                self.tally[f"kills of {arguments[0]} by {signal_.name}"] += 1
+            code = driver.wait()
+            found = [] if code in (0, 1, 3, 128 + signal_, -signal_) else [f"exit code {code}: {driver.said[-300:]}"]
+            found += ["a traceback"] if "Traceback" in driver.said else []
+            found += ["it left a process"] if processes_of(driver.pid) else []
+            self._report(f"{arguments[0]} {number} ({signal_.name} after {after_s:.2f} s)", found)
+        self._report("readers", in_child(partial(problems_after_finish, root, self.expected, {})))
+
     def full_disk(self, every: int) -> None:
         """Refuse the n-th write of a run; it must say so, lose nothing, and finish when the disk has room."""
         one, counter = replace(self.scene, workers=1), self.work / "writes.txt"
@@ -226,6 +248,7 @@ def main() -> int:
     options.add_argument("--kills", type=int, default=100)
     options.add_argument("--pairs", type=int, default=4, help="pairs of drivers started at once")
     options.add_argument("--full-disk", type=int, default=0, metavar="N", help="refuse every N-th write of a run in turn; 1 is every write")
+    options.add_argument("--readers", type=int, default=0, metavar="N", help="kill simrun gate and simrun serve in turn, N times")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--minutes", type=float, default=1e9, help="stop killing after this time")
     given = options.parse_args()
@@ -234,6 +257,7 @@ def main() -> int:
     campaign = Campaign(work, Scene())
     campaign.kill(given.kills, given.seed, 60 * given.minutes)
     campaign.pairs(given.pairs)
+    campaign.readers(given.readers, given.seed)
     if given.full_disk:
         campaign.full_disk(given.full_disk)
     for name, count in sorted(campaign.tally.items()):

@@ -1,7 +1,7 @@
 """Every verb on every machine that lacks something: ``python -m tests.degradation``; needs root, to become another user and to mount.
 
-``--machine`` and ``--verb`` take those whose name contains a word. The table says the exit code of each cell; what ended otherwise than
-docs/cli.md says is printed below it, and makes the command end with 1.
+``--machine`` and ``--verb`` take those whose name contains a word, or one of several with commas between. The table says the exit code of
+each cell; what ended otherwise than docs/cli.md says is printed below it, and makes the command end with 1.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from tests.other_user import can_become_nobody, shared_folder
 def main() -> int:
     """Print the table; return 1 if a cell ended in another way than documented, 4 where this machine does not allow the trial."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--machine", default="", help="machines whose name contains this")
-    parser.add_argument("--verb", default="", help="verbs whose name contains this")
+    parser.add_argument("--machine", default="", help="machines whose name contains this, or one of several: A,B")
+    parser.add_argument("--verb", default="", help="verbs whose name contains this, or one of several: A,B")
     arguments = parser.parse_args()
     if not can_become_nobody():
         print("needs root that may mount, to become another user", file=sys.stderr)
         return 4
-    verbs = [verb for verb in VERBS if arguments.verb in verb]
+    verbs = [verb for verb in VERBS if any(word in verb for word in arguments.verb.split(","))]
     wrong = []
     print(f"| machine | {' | '.join(verbs)} |\n|---|{'---:|' * len(verbs)}")
     with shared_folder() as root:
@@ -31,7 +31,7 @@ def main() -> int:
         made.mkdir()
         make_work(made)
         for name, machine in MACHINES.items():
-            if arguments.machine not in name:
+            if not any(word in name for word in arguments.machine.split(",")):
                 continue
             print(f"| {machine.what} |", end="", flush=True)
             for i, verb in enumerate(verbs):

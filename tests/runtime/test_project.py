@@ -46,15 +46,36 @@ def test_a_commit_a_changed_file_and_a_detached_head(tmp_path: Path) -> None:
 
 
 def test_a_program_that_the_repository_names_is_not_run(tmp_path: Path) -> None:
-    git(tmp_path, "init", "-q")
-    (tmp_path / "spy").write_text(f"#!/bin/sh\ntouch {tmp_path}/was-run\n")
-    (tmp_path / "spy").chmod(0o755)
-    git(tmp_path, "config", "core.fsmonitor", str(tmp_path / "spy"))
-    (tmp_path / "a").write_text("a")
-    git(tmp_path, "-c", "core.fsmonitor=false", "add", "a")
-    git(tmp_path, "-c", "core.fsmonitor=false", "commit", "-qm", "a")
-    assert project(tmp_path)["commit"]
-    assert not (tmp_path / "was-run").exists()
+    spy, own = tmp_path / "spy", tmp_path / "own"
+    spy.write_text(f"#!/bin/sh\necho $0 $@ >> {tmp_path}/was-run\ncat\n")
+    spy.chmod(0o755)
+    own.mkdir()
+    git(own, "init", "-q")
+    (own / "a").write_text("a")
+    git(own, "add", "a")
+    git(own, "commit", "-qm", "a")
+    signed = git(own, "cat-file", "commit", "HEAD").replace(
+        "\n\n", "\ngpgsig -----BEGIN PGP SIGNATURE-----\n \n -----END PGP SIGNATURE-----\n\n", 1
+    )
+    (tmp_path / "commit").write_text(signed + "\n")
+    git(own, "update-ref", "HEAD", git(own, "hash-object", "-t", "commit", "-w", str(tmp_path / "commit")))
+    (own / ".gitattributes").write_text("* filter=x\n")
+    for name in ("core.fsmonitor", "core.sshCommand", "gpg.program", "filter.x.clean", "filter.x.process", "core.alternateRefsCommand"):
+        git(own, "config", name, str(spy))
+    for name, value in (("log.showSignature", "true"), ("filter.x.required", "true"), ("protocol.ext.allow", "always")):
+        git(own, "config", name, value)
+    (own / "a").write_text("b")
+    found = project(own)
+    assert (found["commit"], found["dirty"]) == (git(own, "-c", "log.showSignature=false", "rev-parse", "HEAD"), True)
+    for name, value in (("remote.o.url", f"ext::{spy}"), ("remote.o.promisor", "true"), ("extensions.partialClone", "o")):
+        git(own, "config", name, value)
+    git(own, "config", "core.repositoryFormatVersion", "1")
+    for path in (own / ".git" / "objects").glob("??/*"):  # what is missing would be fetched
+        path.unlink()
+    assert project(own)["commit"] is None
+    git(own, "config", "filter.y=z.clean", str(spy))
+    assert project(own)["commit"] is None
+    assert not (tmp_path / "was-run").exists(), (tmp_path / "was-run").read_text()
 
 
 def test_without_a_repository_or_without_git_it_is_said_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,15 +18,15 @@ import numpy as np
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.hosting import SESSIONS, Sessions
 from alpasim_plugin.alpasim.server.status import answering
-from alpasim_plugin.alpasim.server.views import MAX_TIME_US
+from alpasim_plugin.alpasim.server.views import MAX_TIME_US, Straight, straight_of
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.log.schema import increasing_times, read_camera, read_poses, wire_trajectory
+from alpasim_plugin.log.schema import increasing_times, read_poses, read_transform, wire_trajectory
 from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.wire import api_version, common_pb2, egodriver_pb2
+from alpasim_plugin.wire import api_version, common_pb2, egodriver_pb2, sensorsim_pb2
 
 DOING = "driving for AlpaSim"
 ROUTE_POINTS = 20
@@ -146,9 +146,10 @@ class Driving:
 
     def __init__(self, request: egodriver_pb2.DriveSessionRequest, scenario: Scenario, make: Callable[[Scenario], Policy]) -> None:
         self._seed, self._scenario, self._make = int(request.random_seed), scenario, make
-        self._native = _pinholes(request.rollout_spec.vehicle.available_cameras)
+        self._native = _native(request.rollout_spec.vehicle.available_cameras)
         self._lock = threading.Lock()
-        self._frames: dict[str, Frame] = {}
+        self._frames: dict[str, tuple[Frame, Straight]] = {}
+        self._sizes: dict[str, tuple[int, int]] = {}
         self._history = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
         self._state: Any = None
         self._route_rig: F64 = np.full((ROUTE_POINTS, 3), np.nan)
@@ -156,20 +157,26 @@ class Driving:
         self._cameras: Mapping[str, CameraSpec] = {}
 
     def take_image(self, image: egodriver_pb2.RolloutCameraImage.CameraImage) -> None:
-        """Keep a camera's newest frame.
+        """Keep a camera's newest frame, as the pinhole sees it that policies compute with.
 
         Raises:
-            InputError: The session has no such camera, or it is no image.
+            InputError: The session has no such camera, or it is no image, or one of another size than those before.
         """
         if image.logical_id not in self._native:
             found = f"an image of camera {image.logical_id!r}; the session has {sorted(self._native)}"
             raise InputError(DOING, "submit_image_observation", found, "send only the cameras of the session")
         check_time(image.frame_end_us, "submit_image_observation")
         rgb = decode_image(image.image_bytes, f"camera {image.logical_id!r} at {image.frame_end_us} us")
+        height, width = rgb.shape[:2]
+        if (held := self._sizes.setdefault(image.logical_id, (width, height))) != (width, height):
+            found = f"{width} x {height} pixels after {held[0]} x {held[1]}"
+            raise InputError(DOING, f"camera {image.logical_id!r}", found, "send all images of a camera in one size")
+        lens = straight_of(self._native[image.logical_id].intrinsics, width, height)
+        frame = Frame(int(image.frame_end_us), image.logical_id, lens.image(rgb))
         with self._lock:
-            held = self._frames.get(image.logical_id)
-            if held is None or held.t_us <= image.frame_end_us:
-                self._frames[image.logical_id] = Frame(int(image.frame_end_us), image.logical_id, rgb)
+            newest = self._frames.get(image.logical_id)
+            if newest is None or newest[0].t_us <= frame.t_us:
+                self._frames[image.logical_id] = frame, lens
 
     def take_motion(self, message: egodriver_pb2.RolloutEgoTrajectory) -> None:
         """Append poses; those at or before the newest one are left out."""
@@ -208,7 +215,7 @@ class Driving:
                 return egodriver_pb2.DriveResponse()
             ego, history = self._ego(), self._history
             policy = self._policy = self._policy or self._started(ego)
-            shown = {name: frame for name, frame in self._frames.items() if name in self._cameras}
+            shown = {name: frame for name, (frame, _) in self._frames.items() if name in self._cameras}
             observation = Observation(now_us, shown, self._cameras, replace(ego, t_us=now_us), history, self._route_rig.copy())
             plan = policy.act(observation)
             problem = plan_problem(plan, now_us)
@@ -224,7 +231,10 @@ class Driving:
 
     def _started(self, ego: EgoState) -> Policy:
         """Make the policy for the cameras as they come: an image may have another size than its calibration."""
-        cameras = [_resized(camera, self._frames[name]) for name, camera in self._native.items()]
+        cameras = []
+        for name, camera in self._native.items():
+            lens, mounting = self._frames[name][1], read_transform(camera.rig_to_camera, f"mounting of camera {name!r}")
+            cameras.append(CameraSpec(name, *lens.size, lens.K, mounting))
         known = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
         route = Route(transform_points(ego.T_world_rig, known) if len(known) else ego.T_world_rig[None, :3, 3])
         policy = self._make(replace(self._scenario, cameras=tuple(cameras), route=route))
@@ -274,29 +284,19 @@ def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
     return wire_trajectory(Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(rows[:, 2] + yaw0))), "the plan")
 
 
-def _pinholes(listed: Any) -> dict[str, CameraSpec]:
-    """Return the session's cameras.
+def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.AvailableCamera]:
+    """Return the session's cameras, of any lens that `straight_of` takes.
 
     Raises:
-        InputError: One is no ideal pinhole: policies of this package compute with pinholes. Or there are too many.
+        InputError: A lens or a mounting that is none, or too many cameras.
     """
     if len(listed) > MOST_CAMERAS:
         raise InputError(DOING, "start_session", f"{len(listed)} cameras", f"name at most {MOST_CAMERAS}")
-    out: dict[str, CameraSpec] = {}
     for camera in listed:
-        spec = read_camera(camera)
-        if spec is None:
-            kind = camera.intrinsics.WhichOneof("camera_param") or "no intrinsics"
+        try:
+            straight_of(camera.intrinsics, camera.intrinsics.resolution_w, camera.intrinsics.resolution_h)
+        except InputError as error:
             do_this = "give the driver a pinhole view of it: runtime.extra_cameras in AlpaSim, or a renderer that serves pinholes"
-            raise InputError(DOING, f"camera {camera.logical_id!r}", f"{kind} with distortion", do_this)
-        out[camera.logical_id] = spec
-    return out
-
-
-def _resized(camera: CameraSpec, frame: Frame) -> CameraSpec:
-    """Return a camera at the size of its images."""
-    height, width = frame.rgb.shape[:2]
-    K = camera.K.copy()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    return replace(camera, width=width, height=height, K=K)
+            raise InputError(DOING, f"camera {camera.logical_id!r}", error.found, do_this) from error
+        read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
+    return {camera.logical_id: camera for camera in listed}

@@ -8,6 +8,7 @@ per axis; an f-theta lens scales its principal point per axis and its polynomial
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -29,7 +30,10 @@ READING_LENS = "reading a camera's intrinsics"
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the picture
 MAX_COVER_PX = 6_000_000  # pixels of the covering pinhole; its resolution falls for lenses that need more
 CLOSE_PX = 0.05  # a ray whose projection misses its pixel by more lies outside what the lens model describes
+NEWTON_STEPS, FOUND_PX = 10, 0.5  # of the inverse of a lens, and what it may miss by at the last
 TABLE = 4096  # samples of a radius to angle function
+
+_INVERTING = threading.Lock()  # one lens at a time: a large picture takes a gigabyte for some seconds
 
 
 @dataclass(frozen=True)
@@ -175,6 +179,72 @@ def read_lens(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Lens:
         InputError: No intrinsics, values that make no lens, a windshield model, or a view of more than 80 degrees from the axis.
     """
     return _read(spec.SerializeToString(deterministic=True), width, height)
+
+
+@dataclass(frozen=True, eq=False)
+class Straight:
+    """The pinhole that shows all that a lens sees, in as many columns as the lens's picture has.
+
+    Attributes:
+        K: ``(3, 3)``.
+        size: Its width and height.
+        place: ``(height, width, 2)`` float32 place in the lens's picture of every pixel; None where the lens is that pinhole.
+    """
+
+    K: F64
+    size: tuple[int, int]
+    place: F32 | None
+
+    def image(self, seen: U8) -> U8:
+        """Return the pinhole's picture of the lens's ``(H, W, 3)``; black where the lens sees nothing."""
+        if self.place is None:
+            return seen
+        out: Any = cv2.remap(seen, self.place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return out  # type: ignore[no-any-return]
+
+
+def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
+    """Return the pinhole for the pictures ``(height, width)`` of a lens; see `read_lens`."""
+    return _straight(spec.SerializeToString(deterministic=True), width, height)
+
+
+@lru_cache(maxsize=32)
+def _straight(data: bytes, width: int, height: int) -> Straight:
+    lens = _read(data, width, height)
+    if lens.resample is None:
+        return Straight(lens.K, lens.cover, None)
+    size = width, max(round(lens.cover[1] * width / lens.cover[0]), 1)
+    shrink = np.array(size) / lens.cover
+    with _INVERTING:
+        pixels = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) + np.float32(0.5) for n in size)), axis=-1)
+        wanted, start = ((pixels * by - 0.5).astype(np.float32) for by in (1.0 / shrink, [1.0, height / size[1]]))
+        place = _sought(lens.resample, wanted, start)
+    return Straight(np.diag([*shrink, 1.0]) @ lens.K, size, place)
+
+
+def _sought(there: F32, wanted: F32, start: F32) -> F32:
+    """Invert a map of pixels by Newton's method, which converges from afar as a lens bends one way only.
+
+    Args:
+        there: ``(H, W, 2)`` where each pixel (column, row) goes.
+        wanted: ``(h, w, 2)`` where to.
+        start: ``(h, w, 2)`` first guesses.
+
+    Returns:
+        ``(h, w, 2)`` the pixels that go there; far outside of the picture where none does.
+    """
+    last = np.array([there.shape[1] - 1, there.shape[0] - 1])
+    maps = there, np.gradient(there, axis=1), np.gradient(there, axis=0)
+    at, missed = start, wanted
+    for _ in range(NEWTON_STEPS):
+        here, a, b = (cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for values in maps)
+        missed = wanted - here
+        (p, q), det = np.moveaxis(missed, -1, 0), a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        with np.errstate(all="ignore"):
+            step = np.stack([p * b[..., 1] - q * b[..., 0], q * a[..., 0] - p * a[..., 1]], axis=-1) / det[..., None]
+        at = np.clip(at + np.nan_to_num(step, posinf=0.0, neginf=0.0), 0, last).astype(np.float32)
+    at[np.linalg.norm(missed, axis=-1) > FOUND_PX] = -1e6
+    return at
 
 
 @lru_cache(maxsize=32)
