@@ -58,8 +58,8 @@ class StreamShares:
         InputError: A negative share, or shares that do not add up to one.
     """
 
-    pairs: float = 0.83
-    identity: float = 0.06
+    pairs: float = 0.78
+    identity: float = 0.11
     video: float = 0.01
     damaged_video: float = 0.10
 
