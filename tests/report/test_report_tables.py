@@ -167,9 +167,8 @@ def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> No
     console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(render_table(json.loads((usual_run / "summary.json").read_text())))
     text = console.export_text()
-    counts = "offroad % \u2193", "24 rollouts", "4 scenes", "/22 (", "\u202f%", DASH
-    parts = *counts, "lateral_distance_m m \u2193", "preset paper", "at logged instants only"
-    for part in parts:
+    parts = ("offroad % \u2193", "24 rollouts", "4 scenes", "/22 (", "lateral_distance_m m \u2193", "preset paper", "\u202f%", DASH)
+    for part in (*parts, "at logged instants only"):
         assert part.replace("\u00a0", " ") in text.replace("\u00a0", " ")
 
 

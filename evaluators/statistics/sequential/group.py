@@ -21,7 +21,7 @@ from evaluators.statistics.sequential.line import Plan
 
 Spending = Literal["obrien-fleming", "pocock"]
 LOOKS = 5
-GRID, LOWEST = 2001, -9.0  # of the motion before a look; the motion's standard deviation at the ceiling is 1
+GRID, LOWEST = 601, -9.0  # of the motion before a look; the motion's standard deviation at the ceiling is 1
 
 
 def spent(alpha: float, t: float, spending: Spending) -> float:
