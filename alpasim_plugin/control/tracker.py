@@ -165,7 +165,6 @@ class PlanTracker(Controller):
         # The move is per node of path; in time it takes NODE_S at the preview's speed.
         return float(np.clip(start + change[0] * CONTROL_S / NODE_S, -limit, limit))
 
-
 def _lateral_errors(
     now: BicycleState, start: float, change: F64, ds: float, wheelbase: float, target: F64, normal: F64, max_steer: float
 ) -> tuple[F64, F64]:

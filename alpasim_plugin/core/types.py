@@ -150,7 +150,9 @@ class Frame:
     depth: F32 | None = None  # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
     facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
-    references: tuple[U8, ...] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
+    references: tuple[
+        U8, ...
+    ] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
 
 
 @dataclass(frozen=True)

@@ -237,3 +237,5 @@ def near_line(path: Path, bodies: Bodies, reach_m: float, horizon_m: float) -> t
     touches: Bool = (bodies.xy[:, 0, None] - x) ** 2 + (bodies.xy[:, 1, None] - y) ** 2 <= within[:, None] ** 2  # (M, S)
     runs = touches[:, 0].astype(np.int64) + np.count_nonzero(touches[:, 1:] & ~touches[:, :-1], axis=1)
     return np.flatnonzero(runs), bool((runs > 1).any())
+
+

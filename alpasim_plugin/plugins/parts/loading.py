@@ -189,3 +189,4 @@ def _is_installed(name: str) -> bool:
         return importlib.util.find_spec(name) is not None
     except ValueError:  # a module that was made, not found: __main__
         return True
+
