@@ -1,8 +1,7 @@
-"""Make the README's picture from a run of its main job.
+"""Make docs/img/drive.gif of a run: one scene behind three renderers, with the plan in force drawn into each picture.
 
-    python docs/scripts/first_picture.py RUN
-
-RUN is its run folder.
+simrun --renderer clean,3dgs,onefixer --policy lane-camera --set timing.duration_us=6000000 --out RUN hard/sharp_s_curve
+python docs/scripts/first_picture.py RUN hard-sharp_s_curve
 """
 
 from __future__ import annotations
@@ -12,26 +11,47 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from results import DOCS
+from PIL import Image
 
-RENDERERS = ("clean", "3dgs", "onefixer")
-SCENE = "hard-sharp_s_curve"
-FRAMES, SHOWN = 4, (0, 1, 3)  # of a strip
-QUALITY = 84
+from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
+from alpasim_plugin.core.types import U8
+from alpasim_plugin.log import decode_image, read_asl
+
+COLOURS = {"clean": (11, 107, 179), "3dgs": (194, 84, 10), "onefixer": (0, 128, 106)}
+SIZE, GAP_PX, FRAMES, MS, PALETTE = (320, 180), 6, slice(5, 60, 2), 200, 96
 
 
-def main() -> None:
-    """Lay three frames of each renderer's strip below one another."""
-    rows = []
-    for renderer in RENDERERS:
-        file = Path(sys.argv[1]) / "rollouts" / renderer / "lane-camera" / SCENE / "0" / "strip.jpg"
-        strip = cv2.imread(str(file))
-        if strip is None:
-            sys.exit(f"{file} is no picture; run the README's main job first")
-        frames = np.split(strip, FRAMES, axis=1)
-        rows.append(np.concatenate([frames[i] for i in SHOWN], axis=1))
-    cv2.imwrite(str(DOCS / "img" / "first.jpg"), np.concatenate(rows), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+def frames(log_path: Path, name: str) -> list[U8]:
+    """Return the frames of a rollout ``(H, W, 3)``, with its plans and its name."""
+    log, colour, out = read_asl(log_path), COLOURS[name], []
+    camera = log.info["cameras"][0]
+    scale = SIZE[0] / camera.width
+    for image in log.images[FRAMES]:
+        rgb = cv2.resize(decode_image(image.data, name), SIZE, interpolation=cv2.INTER_CUBIC)
+        plan = [one for one in log.plans if one.now_us <= image.end_us][-1].trajectory
+        steps = [np.linspace(0, 1, n) for n in (60, len(plan))]
+        points = np.stack([np.interp(*steps, plan.xyz[:, k]) for k in range(3)], axis=1)
+        T = interpolate(log.ego, [image.end_us])[0] @ inverse(log.T_rig_box) @ camera.T_rig_camera
+        seen = transform_points(inverse(T), points)
+        seen = seen[seen[:, 2] > 0.5]
+        line = np.round(8 * scale * (seen / seen[:, 2:] @ camera.K.T)[:, :2]).astype(np.int32)
+        for ink, width in (((255, 255, 255), 5), (colour, 3)):
+            cv2.polylines(rgb, [line], False, ink, width, cv2.LINE_AA, 3)
+        cv2.rectangle(rgb, (0, 0), (12 + 9 * len(name), 22), (255, 255, 255), -1)
+        cv2.putText(rgb, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.48, colour, 1, cv2.LINE_AA)
+        out.append(rgb)
+    return out
+
+
+def main(run: Path, scene: str) -> None:
+    """Write the picture."""
+    panels = [frames(run / "rollouts" / name / "lane-camera" / scene / "0" / "rollout.asl", name) for name in COLOURS]
+    gap = np.full((SIZE[1], GAP_PX, 3), 255, np.uint8)
+    rows = [np.concatenate([one, gap, two, gap, three], axis=1) for one, two, three in zip(*panels, strict=False)]
+    pictures = [Image.fromarray(row).convert("P", palette=Image.Palette.ADAPTIVE, colors=PALETTE) for row in rows]
+    out = Path(__file__).parents[1] / "img" / "drive.gif"
+    pictures[0].save(out, save_all=True, append_images=pictures[1:], duration=MS, loop=0, optimize=True)
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]), sys.argv[2])
