@@ -73,11 +73,15 @@ def path_file(folder: Path, bait: Bait) -> list[list[str]]:
 
 def git_hooks(folder: Path, bait: Bait) -> list[list[str]]:
     subprocess.run(["git", "init", "-q", "."], cwd=folder, check=True)
+    (folder / "kept.txt").write_text("as committed")
+    subprocess.run(["git", "add", "kept.txt"], cwd=folder, check=True)
+    subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "a"], cwd=folder, check=True)
+    (folder / "kept.txt").write_text("otherwise")
     hook = folder / "hook"
     hook.write_text(f"#!/bin/sh\n{bait.shell}\n")
     hook.chmod(hook.stat().st_mode | stat.S_IXUSR)
-    names = ("core.fsmonitor", "core.sshCommand", "core.pager", "core.editor", "diff.external", "filter.x.clean", "core.hooksPath")
-    for name in names:
+    core = (f"core.{name}" for name in ("fsmonitor", "sshCommand", "pager", "editor", "hooksPath"))
+    for name in (*core, "diff.external", "filter.x.clean", "gpg.program"):
         subprocess.run(["git", "config", name, str(hook) if name != "core.hooksPath" else "."], cwd=folder, check=True)
     for name in ("post-checkout", "pre-commit", "post-index-change"):
         (folder / name).write_bytes(hook.read_bytes())
