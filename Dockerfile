@@ -23,6 +23,8 @@ COPY configs configs
 COPY evaluators evaluators
 COPY policies policies
 COPY scenarios scenarios
+COPY simrun simrun
+COPY docs docs
 RUN /opt/simrun/bin/pip install .
 
 FROM ${BASE}

@@ -27,6 +27,7 @@ from evaluators.report.html import asset
 from evaluators.report.numbers import plural
 
 MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
+NOTES_BYTES = 600  # what notes of what was left out may add to a page
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def make_page(run: Run, cells: Sequence[WatchedCell], shown: Sequence[WatchedCel
         InputError: A rollout's files are damaged.
     """
     shell = len(render(as_json(index_data(run, cells, (), {"live": False, "notes": [], "report": report})), {}))
-    fitted = fit(run, shown, options.max_bytes - shell, options.fine, options.camera)
+    fitted = fit(run, shown, options.max_bytes - shell - NOTES_BYTES, options.fine, options.camera)
     notes = _notes(cells, shown, fitted.too_many, fitted.fine)
     index = index_data(run, cells, fitted.cells, {"live": False, "notes": notes, "report": report})
     documents = dict(zip((cell.id for cell in fitted.cells), fitted.documents, strict=True))

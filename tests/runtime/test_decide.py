@@ -237,7 +237,8 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
     ],
 )
 def test_questions_that_cannot_be_asked_are_refused(more, found, tmp_path: Path, capsys) -> None:
-    assert run_command(["decide", *more, "--policy", "log-replay", "smoke/straight", "--out", str(tmp_path / "run")]) == 2
+    scenes = ["smoke/straight", "smoke/curve"]
+    assert run_command(["decide", *more, "--policy", "log-replay", *scenes, "--out", str(tmp_path / "run")]) == 2
     assert found in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
