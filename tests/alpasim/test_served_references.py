@@ -41,6 +41,7 @@ def request(entry: SceneEntry, t_us: int) -> RenderRequest:
     return RenderRequest(scenario.start_us + t_us, camera, np.stack([pose, pose]), {})
 
 
+@pytest.mark.slow
 def test_a_view_has_the_same_references_whatever_was_asked_before(file: Path) -> None:
     entry = served(file, "onefixer")
     alone = entry.render(request(entry, 820_000)).references

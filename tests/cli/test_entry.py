@@ -15,6 +15,7 @@ import pytest
 from alpasim_plugin.cli import main
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InternalError
+from tests.examples import first_of, first_rows_of
 
 PLUGIN = '''
 import errno, os, signal
@@ -174,7 +175,7 @@ def test_too_little_memory_or_disk_is_a_failure_of_the_machine(packages: Path, v
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
-@pytest.mark.parametrize("words", [["list", "scenarios"], ["list", "scenarios", "--json"], ["--version"], ["--help"]])
+@pytest.mark.parametrize("words", first_of([["list", "scenarios"], ["list", "scenarios", "--json"], ["--version"], ["--help"]]))
 def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(packages: Path, words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         done = simrun(packages, *words, stdout=full)
@@ -183,7 +184,7 @@ def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(packages: Pat
         assert four_parts(done.stderr)["found"].startswith("No space left on device")
 
 
-@pytest.mark.parametrize("words", [["list", "scenarios"], ["list", "scenarios", "--json"], ["--help"], ["report", "--help"]])
+@pytest.mark.parametrize("words", first_of([["list", "scenarios"], ["list", "scenarios", "--json"], ["--help"], ["report", "--help"]]))
 def test_a_reader_that_has_gone_is_no_failed_gate(packages: Path, words: list[str]) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -236,25 +237,29 @@ def offered(packages: Path, *words: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("words", "among"),
-    [
-        (["chec"], ["check", "check-driver", "check-policy"]),
-        (["gree"], ["greet"]),
-        (["--re"], ["--renderer", "--resume"]),
-        (["--renderer", "clean,one"], ["clean,onefixer"]),
-        (["--policy", "lane-camera", "smoke/c"], ["smoke/curve"]),
-        (["several", "t"], ["two"]),
-    ],
+    first_rows_of(
+        [
+            (["chec"], ["check", "check-driver", "check-policy"]),
+            (["gree"], ["greet"]),
+            (["--re"], ["--renderer", "--resume"]),
+            (["--renderer", "clean,one"], ["clean,onefixer"]),
+            (["--policy", "lane-camera", "smoke/c"], ["smoke/curve"]),
+            (["several", "t"], ["two"]),
+        ]
+    ),
 )
 def test_a_tab_offers_verbs_options_and_names(packages: Path, words: list[str], among: list[str]) -> None:
     assert set(among) <= set(offered(packages, *words))
 
 
+@pytest.mark.slow
 def test_no_name_with_a_colon_is_offered(packages: Path) -> None:
     assert not any(":" in name for name in offered(packages, "--policy", ""))
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.slow
 def test_the_program_gives_each_shell_a_script(packages: Path, shell: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("_SIMRUN_COMPLETE", f"source_{shell}")
     assert "_SIMRUN_COMPLETE" in simrun(packages).stdout

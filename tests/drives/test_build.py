@@ -68,6 +68,7 @@ def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imp
         import_drive(source, tmp_path / "mine")
 
 
+@pytest.mark.slow
 def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_fit: None) -> None:
     source, real = write_kitti(tmp_path / "street", stereo=False), build.measure
 

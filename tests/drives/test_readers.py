@@ -39,6 +39,7 @@ def assert_is_the_street(placed: PlacedDrive, rel: float = 0.03) -> None:
 
 
 @pytest.mark.parametrize("axes", ["opencv", "opengl"])
+@pytest.mark.slow
 def test_transforms_of_both_conventions(tmp_path: Path, axes: str) -> None:
     drive, placed = opened(write_transforms(tmp_path / "a", axes=axes))
     assert drive.metric is None

@@ -53,6 +53,7 @@ def test_the_chance_agrees_with_the_bound_on_several_rows() -> None:
     assert chance_above(rows, 1.0, 1.0).tolist() == [0.0] * 5
 
 
+@pytest.mark.slow
 def test_many_different_values_in_bins_give_almost_the_same_bound_and_none_that_is_lower() -> None:
     x = np.random.Generator(np.random.Philox(7)).normal(0.0, 0.1, 4 * BINS)
     whole = np.concatenate([x[: BINS - 2], np.full(3 * BINS + 2, 0.0)])

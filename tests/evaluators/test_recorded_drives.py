@@ -86,6 +86,7 @@ UNHELD = {
 
 
 @pytest.mark.parametrize("name", LOGS)
+@pytest.mark.slow
 def test_lane_containment_agrees_with_a_plain_rule_written_elsewhere(shared_data, name):
     log = read(shared_data, name)
     rollout, scene = replayed(log, grid(log))

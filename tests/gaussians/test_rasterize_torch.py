@@ -88,6 +88,7 @@ def test_gradients_are_finite_on_a_scene_with_cuts_stops_and_saturation():
         assert leaf.grad.abs().max() > 0, name
 
 
+@pytest.mark.slow
 def test_descent_along_the_gradient_recovers_a_moved_splat():
     target = smooth_scene(3)
     cam = camera(18, 12, 10.0)

@@ -90,6 +90,7 @@ NAMES = ("pack.inner.policy:Mine", "my_policy.py:Mine", "my_policy:Mine", "pack/
 
 
 @pytest.mark.parametrize("name", first_of(NAMES))
+@pytest.mark.slow
 def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also_in_workers(hostile: Path, name: str) -> None:
     (hostile / "my_policy.py").write_text(POLICY)
     (hostile / "with_me.py").write_text(BASE)

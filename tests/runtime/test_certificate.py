@@ -37,6 +37,7 @@ def certificate(plan: RunPlan, root: Path, before: dict | None = None, wanted: C
     return certify(plan, root, manifests, 1, wanted, before)
 
 
+@pytest.mark.slow
 def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Path) -> None:
     found = execute_run(plan_of(), tmp_path, 1, ["simrun"], Announced(), report=False).summary["determinism"]
     assert found["status"] == "equal"

@@ -83,6 +83,7 @@ def test_the_order_depends_on_the_seed_and_the_names_alone() -> None:
     assert sorted(drawing_order(names, 3)) == sorted(names)
 
 
+@pytest.mark.slow
 def test_in_stratified_order_every_batch_has_both_families_and_the_record_names_them(tmp_path: Path) -> None:
     listed = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT)]
     refs = [ScenarioRef(ref.path, seed, ref.overrides) for ref in listed for seed in (1, 2)]
@@ -315,6 +316,7 @@ def test_seeds_are_chosen_as_the_run_goes(tmp_path: Path) -> None:
     assert decided.outcome.exit_code == 0
 
 
+@pytest.mark.slow
 def test_two_policies_behind_one_renderer_are_decided_between(tmp_path: Path) -> None:
     ref = expand("smoke/straight", SHORT)[0]
     refs = [ScenarioRef(ref.path, seed, ref.overrides) for seed in range(1, 5)]

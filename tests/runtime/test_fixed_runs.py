@@ -63,6 +63,7 @@ def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp
         assert (tmp_path / path.relative_to(finished)).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.slow
 def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path, tmp_path: Path) -> None:
     plan = plan_of()
     root = tmp_path / "run"

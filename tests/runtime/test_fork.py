@@ -73,6 +73,7 @@ def test_an_untouched_continuation_is_the_log_to_the_byte(past: LoggedRollout, t
     assert one == other
 
 
+@pytest.mark.slow
 def test_a_stateful_renderer_continues_with_its_history(root: Path, tmp_path: Path) -> None:
     frozen = find_rollout(root, CELL.replace("clean", "broken-frozen"))
     go(frozen, tmp_path)

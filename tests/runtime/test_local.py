@@ -48,6 +48,7 @@ def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not() -> No
     assert found["hangs"] == Lost("it did not finish within 0.5 s", hung=True)
 
 
+@pytest.mark.slow
 def test_what_lost_its_worker_runs_once_more_after_all_others(tmp_path: Path) -> None:
     once = f"dies once {tmp_path / 'seen'}"
     found = list(run_or_retry(work, [once, "dies", "hangs", "a", "b"], 2, 1, 2.0, lambda item: None))

@@ -125,6 +125,7 @@ def test_check_finds_the_damage_and_its_repair_is_one(
     assert comparable(root) == comparable(made)
 
 
+@pytest.mark.slow
 def test_readers_make_damaged_tables_again_and_name_damaged_rollouts(made: Path, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["compare", str(made)]) == 0
     wanted, told = capsys.readouterr()

@@ -87,6 +87,7 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
     assert comparable(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(tmp_path: Path) -> None:
     def plan(video: str) -> RunPlan:
         refs = expand("smoke/straight", ("timing.duration_us=900000",))

@@ -17,6 +17,7 @@ from alpasim_plugin.world.ego import ego_state_from_log
 from scenarios.library import LIBRARY, shipped, shipped_names, suites
 from scenarios.load import load_scenario
 from scenarios.suite import load_suite
+from tests.examples import first_of
 
 BUILT = [name for name in shipped_names() if not name.startswith("real/")]
 CAR = Box(4.855, 1.88, 1.6)
@@ -46,7 +47,7 @@ def test_the_library_is_as_large_as_promised() -> None:
     assert count("real") >= 1
 
 
-@pytest.mark.parametrize("name", BUILT)
+@pytest.mark.parametrize("name", first_of(BUILT, 12))
 def test_expert_stays_on_the_road_and_clear_of_everybody(name: str) -> None:
     s = scenario(name)
     lanes = [shapely.Polygon(np.concatenate([lane.left, lane.right[::-1]])[:, :2]).buffer(1e-3)  # type: ignore[index]
@@ -62,7 +63,7 @@ def test_expert_stays_on_the_road_and_clear_of_everybody(name: str) -> None:
                 assert gap > 0.3, f"{actor.actor_id} at {t / 1e6} s"
 
 
-@pytest.mark.parametrize("name", BUILT)
+@pytest.mark.parametrize("name", first_of(BUILT, 12))
 def test_expert_drives_smoothly(name: str) -> None:
     log = scenario(name).ego_log
     assert (np.diff(log.t_us) == 10_000).all()
@@ -104,6 +105,7 @@ def test_smoke_scenarios_are_short_and_small(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["smoke/lead_car", "highway/congestion", "urban/avenue_traffic"])
+@pytest.mark.slow
 def test_traffic_beside_the_expert_drives_as_it_did_at_load(name: str) -> None:
     """The reactive drivers meet the same ego in the loop as at load, so they come out on their tracks."""
     s = scenario(name)
