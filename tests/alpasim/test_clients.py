@@ -32,6 +32,8 @@ from alpasim_plugin.wire.services import Stub, handlers
 from scenarios.library import shipped_names
 from scenarios.load import load_scenario
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> str:

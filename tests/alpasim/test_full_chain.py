@@ -31,6 +31,8 @@ from evaluators.metrics.presets import preset
 from scenarios.library import shipped_names
 from scenarios.load import load_scenario
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> str:

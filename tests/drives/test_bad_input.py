@@ -17,6 +17,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.build import import_drive
 from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_transforms
 
+pytestmark = pytest.mark.slow
+
 Change = Callable[[Path], None]
 
 

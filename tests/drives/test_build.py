@@ -21,6 +21,8 @@ from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.drives.street import COUNT, STEP_M, Street, write_kitti, write_transforms
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(imported: Path) -> None:
     scenario = load_scenario(imported / "scenario.yaml")

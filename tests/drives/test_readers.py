@@ -16,6 +16,8 @@ from alpasim_plugin.drives.placing import PlacedDrive, place
 from alpasim_plugin.drives.source import SourceDrive, checked
 from tests.drives.street import COUNT, STEP_M, write_colmap, write_kitti, write_transforms
 
+pytestmark = pytest.mark.slow
+
 WAY_M = (COUNT - 1) * STEP_M
 
 

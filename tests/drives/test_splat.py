@@ -19,6 +19,8 @@ from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.drives.street import COUNT, STEP_M, Street, write_colmap, write_transforms
 
+pytestmark = pytest.mark.slow
+
 UNIT = 0.2  # of the model, metres
 
 

@@ -16,6 +16,8 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.notebook.opening import OpenRollout, OpenRun
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("pandas")
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notebook.md"

@@ -22,6 +22,8 @@ from alpasim_plugin.run_folder.schema import ROLLOUTS_FOLDER
 from tests.io.checksum_files import vouch_for
 from tests.plugins.test_hostile_folder import DRIVE, SCRIPT
 
+pytestmark = pytest.mark.slow
+
 Way = Callable[[Path, "Bait"], list[list[str]]]  # (folder, bait) -> commands to try
 
 

@@ -13,6 +13,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from scenarios.load import load_scenario
 
+pytestmark = pytest.mark.slow
+
 BASE = """
 version: 1
 road:

@@ -17,6 +17,8 @@ from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth
 
+pytestmark = pytest.mark.slow
+
 QUICK = replace(SplatRecipe.street(), steps=45, points=3000, cap=3500, save_every=15, densify_every=20)
 GAINS = [(1 + 0.1 * np.sin(i),) * 3 for i in range(8)]
 

@@ -18,6 +18,8 @@ from alpasim_plugin.lab.bench.training_memory import MemoryCell
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:

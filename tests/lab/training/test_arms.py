@@ -30,6 +30,8 @@ from tests.block_fixers.fixer_cases import SMALL_DIT, fixer, run_blocks
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.test_generator import FORM, clips_of, data  # noqa: F401 - data is a fixture
 
+pytestmark = pytest.mark.slow
+
 STEPS = 2  # U
 
 
