@@ -18,6 +18,8 @@ from alpasim_plugin.world.ground import height_at
 from tests.examples import first_of
 from tests.gaussians.scene_maps import STREET_ACTORS, camera_spec, crossing, curve, line, make_scenario, road_lanes, straight
 
+pytestmark = pytest.mark.slow
+
 
 def built(scenario: Scenario) -> SceneGraph:
     return build_scene(scenario, partial(height_at, scenario.ground))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -24,4 +25,4 @@ def test_what_it_registers_lies_in_it(tmp_path: Path) -> None:
     for target in (target for group in project["project"]["entry-points"].values() for target in group.values()):
         module, _, attribute = target.partition(":")
         text = (tmp_path / Path(*module.split("."))).with_suffix(".py").read_text()
-        assert f"{attribute} = " in text, target
+        assert re.search(rf"^({attribute} = |def {attribute}\()", text, re.M), target

@@ -21,6 +21,8 @@ from policies import ConstantVelocity
 from scenarios.suite import expand
 from tests.runtime.test_runs import Announced
 
+pytestmark = pytest.mark.slow
+
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
 SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
 FORGETFUL = "tests.runtime.broken_policies:RemembersEarlierRollouts"

@@ -23,6 +23,8 @@ from policies.simple import LogReplay
 from tests.examples import first_of
 from tests.fixers.block_fixers import Blend, GivesFloats, GuardSteps, LosesAFrame, Raises, ShiftsTime, fixed_offline
 
+pytestmark = pytest.mark.slow
+
 
 class Watching(LogReplay):
     """Drives the log exactly and keeps every frame it is shown."""

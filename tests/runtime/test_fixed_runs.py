@@ -20,6 +20,8 @@ from alpasim_plugin.runtime.summary import speed
 from scenarios.suite import expand
 from tests.runtime.test_runs import Announced, comparable
 
+pytestmark = pytest.mark.slow
+
 SMALL_NET = ("weights.bundle=null", "dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random")
 SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height: 64}]")
 

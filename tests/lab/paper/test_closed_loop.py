@@ -71,8 +71,7 @@ def test_rates_and_differences_are_those_of_a_run() -> None:
     text = closed_loop_section(published(), [Driven("learned", rows)], "f.png")
     means, off = aggregate(rows)["3dgs"]["offroad"], METRICS.index("offroad")
     low, high = means["ci95_clustered"]
-    half = f"{100 * means['ci95']:.1f}"
-    assert table(text, "renderer")["3dgs"][off] == f"60.0 (36 of 60), ±\u00a0{half} · {100 * low:.1f} to {100 * high:.1f}"
+    assert table(text, "renderer")["3dgs"][off] == f"60.0, 36/60 ({100 * low:.1f} to {100 * high:.1f}\u202f%)"
     entry = paired(rows, "3dgs")["V9"]["offroad"]
     low, high = (f"{100 * bound:.1f}".replace("-", "−") for bound in entry["ci95"])
     assert table(text, "minus 3dgs")["V9"][off] == f"**−60.0\u00a0points ({low} to {high}), p < 0.001**"
@@ -130,7 +129,7 @@ def test_a_failed_rollout_is_in_no_rate_and_a_lopsided_interval_shows_its_bounds
     rows = rows_of({"3dgs": lambda scene, seed: scene == 0 and seed == 0, "V9": never})
     rows[0] |= {"status": "failed", "failure_class": "renderer"}  # the only one with the event
     text = closed_loop_section(published(), [Driven("learned", rows)], "f.png")
-    assert table(text, "renderer")["3dgs"][METRICS.index("offroad")].startswith("0.0 (0 of 59)")
+    assert table(text, "renderer")["3dgs"][METRICS.index("offroad")].startswith("0.0, 0/59 (0.0 to ")
     rows[0] |= {"status": "ok"}
     driven = Driven("learned", rows)
     comparison = Comparison(driven.protocol, "offroad", "V9", "3dgs")
