@@ -71,6 +71,7 @@ def test_rates_and_differences_are_those_of_a_run() -> None:
     text = closed_loop_section(published(), [Driven("learned", rows)], "f.png")
     means, off = aggregate(rows)["3dgs"]["offroad"], METRICS.index("offroad")
     low, high = means["ci95_clustered"]
+    half = f"{100 * means['ci95']:.1f}"
     assert table(text, "renderer")["3dgs"][off] == f"60.0, 36/60 ({100 * low:.1f} to {100 * high:.1f}\u202f%)"
     entry = paired(rows, "3dgs")["V9"]["offroad"]
     low, high = (f"{100 * bound:.1f}".replace("-", "−") for bound in entry["ci95"])
