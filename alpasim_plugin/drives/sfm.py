@@ -1,7 +1,7 @@
 """Photographs without poses, and videos: structure from motion by COLMAP (extra ``sfm``), with settings for a car that drives straight on.
 
 COLMAP's defaults look for a first pair of photographs with much sideways motion, which such a car never makes: forward motion is allowed,
-angles and numbers of inliers are lowered. Which lens it was is told by matches of photographs far apart: a wide one bends lines.
+angles and numbers of inliers are lowered. The lens model (pinhole or fisheye) is chosen by epipolar inliers between distant photographs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from alpasim_plugin.io.reading import read_json
 PLAIN = "SIMPLE_RADIAL"
 LENSES = {PLAIN: 0.8, "SIMPLE_RADIAL_FISHEYE": 0.5}  # tried, and their focal length at first, in widths: 64 and 115 degrees across
 FEATURES, OVERLAP = 2500, 5  # of a photograph; the next ones that it is matched with, and then the 8th, 16th, ...
-FAR, CLEARLY = 8, 1.05  # photographs between two by which lenses are told apart; by how much a wide one must explain more
+FAR, CLEARLY = 8, 1.05  # photographs between the two of a pair; ratio of inliers from which the fisheye model is chosen
 TURNS_RAD = np.radians(3.0)  # of a camera's axis from its mean, by which photographs tell the focal length
 LEAST_DEEP = 0.1  # of the pairs of photographs must show depth
 LEAST_SHARE = 0.5  # of the photographs that must be registered

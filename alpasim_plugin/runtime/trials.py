@@ -98,7 +98,7 @@ def brightness(factor: float) -> See:
 
 
 def speed(factor: float) -> See:
-    """Return the change that multiplies the speed that the policy is told."""
+    """Return the change that multiplies the ego speed in the observation."""
     return lambda o: replace(o, ego=replace(o.ego, speed_mps=o.ego.speed_mps * factor))
 
 

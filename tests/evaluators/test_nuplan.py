@@ -19,6 +19,7 @@ SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_
     "ego_acceleration": "accel", "ego_lon_acceleration": "lon_accel", "ego_lat_acceleration": "lat_accel",
     "ego_yaw_acceleration": "yaw_accel",
 }  # fmt: skip
+OF_PLANS = ("planner_expert_average_l2_error_within_bound", "planner_miss_rate_within_bound")  # not measured here
 
 
 def states(rows) -> EgoStates:
@@ -65,17 +66,18 @@ def found_statistics(name, scene) -> list[float | bool]:
         given = scene["metric_parameters"]
         least = nuplan.time_to_collision(ego, others, hits, None, given["time_step_size"], given["time_horizon"]).min()
         return [round(least, 2), bool(least > given["least_min_ttc"])]
-    pytest.skip(f"{name} asks for a map or for plans that the file does not hold")
+    assert name in OF_PLANS, f"no definition of ours is held to {name}"
+    pytest.skip(f"{name} compares plans, and the file holds only the drive")
 
 
 @pytest.mark.skipif(not FILES, reason="../shared/data/nuplan-devkit-fixtures is absent")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_the_devkits_own_test_vectors_give_its_numbers_to_all_printed_digits(path):
+def test_the_devkits_test_vectors_give_its_series_to_all_printed_digits_and_its_statistics_nearly(path):
     scene = json.loads(path.read_text())
     name, expected = path.parent.name, scene["expected"]
     got = found_statistics(name, scene)
     wanted = [value for kind, value in expected["statistics"] if name not in SERIES or kind != "BOOLEAN"]
-    # Its tests allow 1.5 units of the second digit, and two of the statistics printed there are cut and not rounded.
+    # Two of the statistics printed there differ from ours by one unit of the second digit: 0.62 for 0.63 and 0.71 for 0.72.
     assert got == pytest.approx(wanted, abs=0.015)
     if name in SERIES:
         values = nuplan.motion(states([scene["ego"], *scene["ego_future_states"]]))[SERIES[name]]

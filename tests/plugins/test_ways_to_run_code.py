@@ -5,11 +5,9 @@ Each way is a bait that leaves its name in a file if it is run. The working dire
 
 from __future__ import annotations
 
-import os
 import pickle
 import stat
 import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +18,7 @@ import torch
 
 from alpasim_plugin.run_folder.schema import ROLLOUTS_FOLDER
 from tests.io.checksum_files import vouch_for
-from tests.plugins.test_hostile_folder import DRIVE, SCRIPT
+from tests.plugins.test_hostile_folder import DRIVE, simrun
 
 pytestmark = pytest.mark.slow
 
@@ -209,17 +207,8 @@ QUICK = ("distribution metadata and entry points",)
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
-    assert _simrun(folder, [*DRIVE, "--policy", "constant-velocity", "--out", "run", "smoke/straight"]).returncode == 0
+    assert simrun(folder, *DRIVE, "--policy", "constant-velocity", "--out", "run", "smoke/straight").returncode == 0
     return folder / "run"
-
-
-def _simrun(folder: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]:
-    script = folder.parent / "bin" / "simrun"
-    script.parent.mkdir(exist_ok=True)
-    script.write_text(SCRIPT)
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONSAFEPATH")}
-    command = [sys.executable, str(script), *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240)
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in WAYS])
@@ -230,7 +219,7 @@ def test_nothing_of_a_strangers_folder_runs(name: str, finished: Path, tmp_path:
     assert (folder / "run" / ROLLOUTS_FOLDER).is_dir()
     bait = Bait(folder, name.replace(" ", "-"))
     for command in WAYS[name](folder, bait):
-        done = _simrun(folder, command)
+        done = simrun(folder, *command)
         assert not bait.mark.exists(), f"{command} ran it"
         assert "Traceback" not in done.stderr, done.stderr
         assert done.returncode in (0, 1, 2, 3, 4, 5), (command, done.stderr)

@@ -166,10 +166,10 @@ def test_a_change_undoes_the_fault_that_it_names(name: str) -> None:
     seen = observed(0, 0.0)
     seen = replace(seen, frames={"front": replace(seen.frames["front"], rgb=rgb)}, route_rig=np.arange(60.0).reshape(20, 3))
     broken, right = Changed(Asked(), FAULTS[name]), Asked()
-    mended = Changed(broken, named(name))
-    for policy in (mended, right):
+    corrected = Changed(broken, named(name))
+    for policy in (corrected, right):
         policy.reset(0, ROUTE)
-    wanted, given = right.act(seen), mended.act(seen)
+    wanted, given = right.act(seen), corrected.act(seen)
     early = slice(0, 20)  # a plan that is meant twice as fast ends at half its time
     at = [np.interp(wanted.times_us[early], given.times_us, given.xy[:, k]) for k in (0, 1)]
     assert np.allclose(np.stack(at, axis=1), wanted.xy[early], atol=1e-6)

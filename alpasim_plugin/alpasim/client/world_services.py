@@ -187,7 +187,7 @@ def plan_in_rig(plan: Trajectory, state: EgoState) -> Trajectory:
 
 
 def _sent(pose: Any, what: str, service: Service) -> F64:
-    """Read what a service sent; a pose that is none is its failure."""
+    """Read what a service sent; an invalid pose is its failure."""
     try:
         return read_transform(pose, what)
     except InputError as error:

@@ -131,7 +131,7 @@ class SceneCache:
         kept: Scenes that stay loaded, the least recently used going first.
 
     Raises:
-        InputError: A place without a scene, a file that is none, or two scenes of one id.
+        InputError: A place without a scene, a file that is no scene, or two scenes of one id.
     """
 
     def __init__(

@@ -288,7 +288,7 @@ def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.Avail
     """Return the session's cameras, of any lens that `straight_of` takes.
 
     Raises:
-        InputError: A lens or a mounting that is none, or too many cameras.
+        InputError: An invalid lens or camera pose, or too many cameras.
     """
     if len(listed) > MOST_CAMERAS:
         raise InputError(DOING, "start_session", f"{len(listed)} cameras", f"name at most {MOST_CAMERAS}")

@@ -137,7 +137,7 @@ def arms_in(folder: Path, option: str = "--arms", steps_of: Mapping[str, tuple[i
         steps_of: ARM -> its numbers of steps; None: the bundle's own, under the arm's plain name.
 
     Raises:
-        InputError: No folder, or a bundle that is none.
+        InputError: No folder, or a file that is no bundle.
     """
     if not folder.is_dir():
         raise InputError(
