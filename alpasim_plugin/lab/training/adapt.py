@@ -136,7 +136,10 @@ def _trained(root: Path, weights: Path, updates: int, distance: tuple[str, Dista
     settings = resolve("fixer", name, overrides).settings
     if not isinstance(settings, PixelFixerSettings):
         raise InputError(DOING, str(weights), f"weights of {name}", "give those of onefixer")
-    streams = TrainingStreams(root / "pairs", seed=seed, batch=4, frames=4, crop=CROP, episode=6, shares=StreamShares(0.93, 0.07, 0.0, 0.0))
+    width, height = PairSequence(root / "pairs" / "train" / "drive_0").size
+    crop = min(CROP[0], height), min(CROP[1], width)
+    shares = StreamShares(pairs=0.93, identity=0.07, video=0.0, damaged_video=0.0)
+    streams = TrainingStreams(root / "pairs", seed=seed, batch=4, frames=4, crop=crop, episode=6, shares=shares)
     schedule = Schedule(updates, peak_lr=LR, warmup=min(WARMUP, updates), clip=0.5, ema=0.9)
     return train_per_frame(
         PixelRun(settings, streams, pixel_variant(VARIANT), schedule, weights, seed), root / "run", distance, report=report
