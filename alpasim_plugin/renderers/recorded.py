@@ -26,6 +26,7 @@ from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
 DOING = "reading a recorded photograph"
+SIDE_PX = 16
 INTERVAL_US, FIRST_US = 500_000, 50_000  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
 POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
@@ -129,10 +130,23 @@ def photograph_camera(one: Photograph, width: int) -> PinholeCamera:
     return PinholeCamera.from_pose(w, h, np.diag([w / one.width, h / one.height, 1.0]) @ one.K, one.T_world_camera)
 
 
-def posed_photograph(one: Photograph, width: int) -> tuple[PinholeCamera, U8]:
-    """Read a photograph at a width in pixels, never larger than it is, and return its camera and picture ``(H, W, 3)``."""
-    camera = photograph_camera(one, width)
-    return camera, photograph_picture(one, camera)
+def posed_photograph(one: Photograph, width: int, height: int | None = None) -> tuple[PinholeCamera, U8]:
+    """Read a photograph at sides that are multiples of 16, as fixers need; its height is cut at the middle.
+
+    Args:
+        one: The photograph.
+        width: Pixels across at most, never more than it has.
+        height: Pixels down at most; None keeps what there is.
+
+    Returns:
+        Its camera, and its picture ``(H, W, 3)``.
+    """
+    whole = photograph_camera(one, min(width, one.width) // SIDE_PX * SIDE_PX)
+    kept = max(SIDE_PX, min(height or whole.height, whole.height) // SIDE_PX * SIDE_PX)
+    top = (whole.height - kept) // 2
+    K = whole.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
+    picture = photograph_picture(one, whole)[top : top + kept]
+    return PinholeCamera(whole.width, kept, K, whole.T_camera_world), np.ascontiguousarray(picture)
 
 
 def photograph_picture(one: Photograph, camera: PinholeCamera) -> U8:

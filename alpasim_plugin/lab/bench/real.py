@@ -29,7 +29,6 @@ from alpasim_plugin.renderers.recorded import posed_photograph
 DOING = "measuring renderers against photographs"
 SETS = ("held-out", "never-fitted")
 BIN_M = (0.25, 0.75, 1.5, 3.0)  # rows end at these distances from the recorded path
-SIDE_PX = 16  # sides are multiples of this, as fixers need
 METRICS = ("psnr_db", "ssim", "perceptual_syn", "cvvdp_jod", "warp_l1", "paint_precision", "paint_recall")
 Row = dict[str, str | int | float | None]
 Report = Callable[[str, int, int], None]
@@ -90,13 +89,9 @@ def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
 
 def _shot(scenario: Scenario, one: Photograph, path: F64) -> Shot:
     spec = next((camera for camera in scenario.cameras if camera.name == one.camera), scenario.cameras[0])
-    camera, rgb = posed_photograph(one, min(spec.width, one.width) // SIDE_PX * SIDE_PX)
-    kept = max(SIDE_PX, min(spec.height, camera.height) // SIDE_PX * SIDE_PX)
-    top = (camera.height - kept) // 2
-    K = camera.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
-    cut = PinholeCamera(camera.width, kept, K, camera.T_camera_world)
-    road = road_of(cut, scenario.ground, scenario.ego_log.xyz)
-    return Shot(one, cut, np.ascontiguousarray(rgb[top : top + kept]), _distance(path, one.T_world_camera[:3, 3]), road)
+    camera, rgb = posed_photograph(one, spec.width, spec.height)
+    road = road_of(camera, scenario.ground, scenario.ego_log.xyz)
+    return Shot(one, camera, rgb, _distance(path, one.T_world_camera[:3, 3]), road)
 
 
 def _distance(path: F64, place: F64) -> float:

@@ -25,7 +25,7 @@ from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.lab.bench.quality import Variant, run_variant
 from alpasim_plugin.lab.bench.quality_run import quality_clip
-from alpasim_plugin.lab.training.drive_pairs import DRIVE, SIDE_PX, Shot, write_drive_sequence
+from alpasim_plugin.lab.training.drive_pairs import DRIVE, Shot, write_drive_sequence
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.pixel_rollout import Distance
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
@@ -112,8 +112,7 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
         found = f"{count['fitted']} fitted and {count['held-out']} held-out photographs of camera {camera!r}"
         do = f"give an imported drive (simrun import drive) with at least {FEWEST} and {ENOUGH} of them"
         raise InputError(DOING, scenario.scene_id, found, do)
-    width = min(WIDTH_PX, taken[0].width // SIDE_PX * SIDE_PX)
-    shots = [Shot.read(one, width) for one in taken]
+    shots = [Shot.read(one, WIDTH_PX) for one in taken]
     fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
     held = [shot for shot in shots if shot.photograph.use == "held-out"]
     for split, shown in (("train", fitted), ("judge", held)):

@@ -33,12 +33,11 @@ from alpasim_plugin.lab.training.photograph_pairs import DOING, PhotographPairs,
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.renderers.recorded import photograph_camera, photograph_picture
+from alpasim_plugin.renderers.recorded import posed_photograph
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 
 DRIVE = "drive"  # the family of these sequences
-SIDE_PX = 16  # heights are cut at the middle to a multiple of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +51,7 @@ class Shot:
     @classmethod
     def read(cls, one: Photograph, width: int) -> Self:
         """Read a photograph at a width in pixels, never larger than it is."""
-        whole = photograph_camera(one, width)
-        height = whole.height // SIDE_PX * SIDE_PX
-        top = (whole.height - height) // 2
-        K = whole.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
-        rgb = np.ascontiguousarray(photograph_picture(one, whole)[top : top + height])
-        return cls(one, PinholeCamera(whole.width, height, K, whole.T_camera_world), rgb)
+        return cls(one, *posed_photograph(one, width))
 
     def spec(self, scenario: Scenario) -> CameraSpec:
         """Return its camera on the rig."""
