@@ -66,6 +66,7 @@ def driver(address: str, *more: str) -> Iterator[None]:
             process.kill()
 
 
+@pytest.mark.slow
 def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_driven_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

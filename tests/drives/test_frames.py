@@ -51,6 +51,7 @@ def test_motion_is_that_of_the_world_beside_a_bonnet() -> None:
     assert moved_px(before, before) == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_films_that_follow_each_other_are_one_drive(tmp_path: Path) -> None:
     folder = tmp_path / "films"
     folder.mkdir()

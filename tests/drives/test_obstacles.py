@@ -80,6 +80,7 @@ def test_haze_background_and_what_is_too_high_or_low_do_not_stand(size_m: float,
     assert standing_obstacles(cloud_at(body, size_m, opacity), points_at(body, 0.05), flat(), straight(), Vehicle()).obstacles == ()
 
 
+@pytest.mark.slow
 def test_contact_with_what_stands_is_reported_apart_and_is_unknown_where_it_was_not_looked_for(imported: Path) -> None:
     from evaluators.metrics.collision import evaluate_collision
     from evaluators.metrics.presets import preset

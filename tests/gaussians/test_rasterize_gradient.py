@@ -104,6 +104,7 @@ HARD = (
 
 
 @pytest.mark.parametrize("make", HARD)
+@pytest.mark.slow
 def test_gradient_equals_finite_differences_of_the_reference(make):
     s = make()
     found, _ = kernel_gradients(s)

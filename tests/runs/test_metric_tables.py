@@ -94,6 +94,7 @@ def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(places: Path, c
     assert "height_m" not in capsys.readouterr().out  # nothing of a run stays behind in the process
 
 
+@pytest.mark.slow
 def test_no_two_series_of_a_run_measure_the_same_quantity_under_two_names(tmp_path: Path) -> None:
     root = tmp_path / "run"
     assert (
