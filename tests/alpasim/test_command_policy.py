@@ -29,6 +29,8 @@ from alpasim_plugin.process.stdout import MOST_BYTES, parts_print_to_stderr, say
 from alpasim_plugin.process.subprocesses import Child, end_children, exit_reason
 from policies.conformance import STRAIGHT, canned_scenario, observations
 
+pytestmark = pytest.mark.slow
+
 REPO = Path(__file__).resolve().parents[2]
 HEAVY = "torch numba scipy shapely pydantic yaml pyarrow typer av matplotlib"
 PAGE = (REPO / "docs" / "policy-commands.md").read_text(encoding="utf-8")

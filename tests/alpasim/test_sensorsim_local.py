@@ -23,6 +23,8 @@ from alpasim_plugin.wire.services import Stub
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import answers, channel_to, hosted, in_front_of, pinhole
 
+pytestmark = pytest.mark.slow
+
 SCENE = "smoke/lead_car"
 W, H = 64, 36
 

@@ -18,6 +18,8 @@ from alpasim_plugin.plugins.interfaces import Fixer
 from tests.block_fixers.fixer_cases import busy_settings, fixer, record_videos, run_blocks, small_settings
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
 
+pytestmark = pytest.mark.slow
+
 FRAMES = moving_picture(29)
 MAPS = maps_of(FRAMES)
 

@@ -18,6 +18,8 @@ from alpasim_plugin.core.errors import InputError
 from tests.block_fixers.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 from tests.examples import examples, first_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def vae() -> WanVAE:

@@ -27,6 +27,8 @@ from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities 
 from alpasim_plugin.control.can_replay import decode, read_recording, replay  # noqa: E402
 from alpasim_plugin.core.types import Vehicle  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 class NoCamera(Renderer):
     def render(self, request: RenderRequest) -> Frame:

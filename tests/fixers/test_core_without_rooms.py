@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOMS = ("alpasim_plugin.block_fixers", "alpasim_plugin.lab")
 
 ALONE = """

@@ -28,6 +28,8 @@ from tests.gaussians.gradient_scenes import (
     weights_of,
 )
 
+pytestmark = pytest.mark.slow
+
 SMALL = camera(24, 18, 20.0)
 TOLERANCE = 5e-4  # of the largest gradient of a Gaussian in a field; float32 sums of terms that cancel
 

@@ -166,6 +166,7 @@ def test_a_failed_rollout_ends_the_decision(tmp_path: Path) -> None:
     assert "rollouts failed" in decided.record["stopped"]
 
 
+@pytest.mark.slow
 def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, capsys) -> None:
     words = [
         "decide",

@@ -29,6 +29,8 @@ from tests.examples import first_of
 from tests.runtime.test_certificate import BARE
 from tests.runtime.test_runs import Announced
 
+pytestmark = pytest.mark.slow
+
 SHORT = ("timing.duration_us=1200000", "timing.warmup_us=200000", "degradation.kind=surrogate", *BARE)
 CELL = "clean/lane-camera/smoke-lead_car/0"
 AT_US = 600_000
