@@ -47,6 +47,7 @@ def changed(column: str, value: Any) -> pa.Table:
         (changed("scene", None), ", row 2", "column 'scene': nothing, wanted text"),
         (changed("seed", None), ", row 2", "column 'seed': nothing, wanted integer"),
         (changed("frames", -1), ", row 2", "column 'frames': a value below 0"),
+        (changed("frames", -(2**63)), ", row 2", "column 'frames': a value below 0"),
         (changed("wall_s", -0.5), ", row 2", "column 'wall_s': a value below 0"),
     ],
 )
