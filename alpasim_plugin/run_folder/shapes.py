@@ -233,7 +233,8 @@ class Summary(TypedDict, total=False):
     plans: dict[str, dict[str, Any]]
 
 
-Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+REACH_M = 1e6  # of a position in a run folder; drives begin near their origin, or in coordinates of a map
+Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
 Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
 
 
