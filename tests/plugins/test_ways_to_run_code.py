@@ -20,8 +20,6 @@ from alpasim_plugin.run_folder.schema import ROLLOUTS_FOLDER
 from tests.io.checksum_files import vouch_for
 from tests.plugins.test_hostile_folder import DRIVE, simrun
 
-pytestmark = pytest.mark.slow
-
 Way = Callable[[Path, "Bait"], list[list[str]]]  # (folder, bait) -> commands to try
 
 
@@ -201,7 +199,6 @@ WAYS: dict[str, Way] = {
     "words that a shell would run": shells,
     "programs beside the command": programs,
 }  # fmt: skip
-QUICK = ("distribution metadata and entry points",)
 
 
 @pytest.fixture(scope="module")
@@ -211,14 +208,25 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in WAYS])
-def test_nothing_of_a_strangers_folder_runs(name: str, finished: Path, tmp_path: Path) -> None:
+ALL_AT_ONCE = [
+    ["compare", "run"],
+    ["list", "policies"],
+    ["run", "--dry-run", *DRIVE[1:], "smoke/straight"],
+    ["run", "--dry-run", *DRIVE[1:], "scene.yaml"],
+]
+
+
+@pytest.mark.parametrize(
+    "names", [pytest.param(tuple(WAYS), id="all ways at once"), *(pytest.param((name,), id=name, marks=pytest.mark.slow) for name in WAYS)]
+)
+def test_nothing_of_a_strangers_folder_runs(names: tuple[str, ...], finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "stranger"
     folder.mkdir()
     subprocess.run(["cp", "-r", str(finished), str(folder / "run")], check=True)
     assert (folder / "run" / ROLLOUTS_FOLDER).is_dir()
-    bait = Bait(folder, name.replace(" ", "-"))
-    for command in WAYS[name](folder, bait):
+    bait = Bait(folder, "bait")
+    own = [command for name in names for command in WAYS[name](folder, bait)]
+    for command in own if len(names) == 1 else ALL_AT_ONCE:
         done = simrun(folder, *command)
         assert not bait.mark.exists(), f"{command} ran it"
         assert "Traceback" not in done.stderr, done.stderr
