@@ -32,8 +32,6 @@ from alpasim_plugin.wire.services import Stub, methods
 from tests.alpasim.service_cases import START_US, StandInRenderer, channel_to, hosted, pinhole, request
 from tests.alpasim.test_server_lenses import ftheta
 
-pytestmark = pytest.mark.slow
-
 EMPTY = common_pb2.Empty()
 Code = grpc.StatusCode
 SERVICES = ("SensorsimService", "EgodriverService")
