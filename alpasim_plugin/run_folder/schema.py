@@ -112,10 +112,12 @@ class TableSchema:
     Attributes:
         name: Its file.
         columns: In the order of the file; those of the metrics follow.
+        identity: Columns that name a row, as far as a file has them: no two rows agree in all.
     """
 
     name: str
     columns: tuple[Column, ...]
+    identity: tuple[str, ...] = ()
 
     @property
     def required(self) -> dict[str, Kind]:
@@ -155,6 +157,9 @@ class TableSchema:
         for column in stated:
             if _is_suspicious(facts, column):
                 _check_values(path, column, doing, do_this)
+        if identity := [name for name in self.identity if name in names]:
+            kinds = {column.name: column.kind for column in self.columns if column.name in identity}
+            _check_identity(read_parquet(path, doing, kinds, do_this, only=True), path, doing, do_this)
         return names
 
     def read(self, path: Path, doing: str = DOING, do_this: str = AGAIN, only: Sequence[str] | None = None) -> pa.Table:
@@ -201,6 +206,7 @@ ROLLOUTS_TABLE = TableSchema(
         Column("frames", "integer", least=0),
         Column("steps", "integer", least=0),
     ),
+    identity=(*KEYS, LOG_COLUMN.name),
 )
 STEPS_TABLE = TableSchema(
     STEPS,
@@ -246,6 +252,18 @@ def _check_values(path: Path, column: Column, doing: str, do_this: str) -> None:
         row = pc.index(wrong, True).as_py()
         if row >= 0:
             raise InputError(doing, f"{path}, row {row}", f"column {column.name!r}: {found}", do_this)
+
+
+def _check_identity(keys: pa.Table, path: Path, doing: str, do_this: str) -> None:
+    """Refuse rows that are named alike: each would count as a rollout of its own."""
+    counted = keys.group_by(keys.column_names).aggregate([([], "count_all")])
+    if counted.num_rows == keys.num_rows:
+        return
+    often = counted.sort_by([("count_all", "descending")]).slice(0, 1).to_pylist()[0]
+    times = often.pop("count_all")
+    raise InputError(
+        doing, str(path), f"{times} rows of {', '.join(f'{key} {value!r}' for key, value in often.items())}, wanted one", do_this
+    )
 
 
 SLUG_LENGTH = 80

@@ -15,7 +15,7 @@ from tests.other_user import NOBODY, run_as_nobody
 REPO = Path(__file__).resolve().parents[2]
 DOCUMENTED = (0, 1, 2, 3, 4, 5)
 DRIVE = ("run", "--renderer", "clean", "--images", "none", "--certify", "none", "--no-report", "--policy", "constant-velocity")
-# @run: a finished run; @new: a folder that can be made, where the machine lets it be made.
+# @run: a finished run; @out: a folder; @new: one in it that can be made, where the machine lets it be made.
 VERBS: dict[str, tuple[str, ...]] = {
     "list": ("list", "renderers"),
     "compare": ("compare", "@run"),
@@ -31,7 +31,7 @@ VERBS: dict[str, tuple[str, ...]] = {
     "run": (*DRIVE, "--out", "@new", "smoke/straight"),
     "dry run": (*DRIVE, "--dry-run", "smoke/straight"),
     "doctor": ("doctor",),
-    "new": ("new", "policy", "mine", "--folder", "@new"),
+    "new": ("new", "policy", "mine", "--folder", "@out"),
     "check-policy": ("check-policy", "constant-velocity"),
 }
 KERNELS = "home/.cache/simrun/numba"
@@ -126,7 +126,7 @@ def outcome(machine: Machine, verb: str, made: Path, work: Path) -> Outcome:
         os.chown(path, NOBODY, NOBODY, follow_symlinks=False)
     machine.prepare(work)
     log = next((made / "runs").rglob("rollout.asl")).relative_to(made)
-    words = {"@runs": work / "runs", "@run": work / "runs" / "one", "@log": work / log, "@new": work / "out" / "new"}
+    words = {"@runs": work / "runs", "@run": work / "runs" / "one", "@log": work / log, "@new": work / "out" / "new", "@out": work / "out"}
     arguments = [_filled(word, words) for word in VERBS[verb]]
     script = f"import sys; sys.path.insert(0, {str(REPO)!r}); from alpasim_plugin.cli.main import main; main()"
     variables = {key: value.format(work=work) for key, value in machine.variables.items()}

@@ -49,6 +49,7 @@ def changed(column: str, value: Any) -> pa.Table:
         (changed("frames", -1), ", row 2", "column 'frames': a value below 0"),
         (changed("frames", -(2**63)), ", row 2", "column 'frames': a value below 0"),
         (changed("wall_s", -0.5), ", row 2", "column 'wall_s': a value below 0"),
+        (pa.Table.from_pylist([*ROWS, ROWS[0], ROWS[0]]), "", "3 rows of renderer "),
     ],
 )
 @pytest.mark.parametrize("with_statistics", [True, False])
