@@ -8,7 +8,8 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, lane_polygon
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from alpasim_plugin.world.road_strip import Curve, Element, Intersection, LaneTaper, Profile

@@ -16,7 +16,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import lane_polygon, offset_trajectory, quat_from_yaw, rectangle_corners
+from alpasim_plugin.core.geometry import offset_trajectory, quat_from_yaw, rectangle_corners
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, I64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.io.limits import STEP, TIME_STEP_S
 from alpasim_plugin.world.ground import flat, from_points

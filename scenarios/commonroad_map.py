@@ -10,7 +10,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import centre_line, lane_polygon
+from alpasim_plugin.core.geometry import centre_line
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
 from scenarios.reading import SourceFiles

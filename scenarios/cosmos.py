@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import centre_line, densify, lane_polygon, quat_from_matrix, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.geometry import centre_line, densify, quat_from_matrix, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.cosmos_camera import FRONT_WIDE, front_camera, read_lenses

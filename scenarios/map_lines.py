@@ -16,7 +16,8 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import HALF_WIDTH_M, arc_lengths, densify
+from alpasim_plugin.core.geometry import arc_lengths, densify
+from alpasim_plugin.core.lane_areas import HALF_WIDTH_M
 from alpasim_plugin.core.types import F64, Lane, LaneMap
 
 MAX_STEP_M = 2.0

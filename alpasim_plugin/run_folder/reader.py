@@ -17,7 +17,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.reading import parsing, read_json_as, read_json_object
 from alpasim_plugin.run_folder.check import planned_cells
 from alpasim_plugin.run_folder.manifests import inspect_rollout, read_run_json
@@ -38,11 +37,10 @@ from alpasim_plugin.run_folder.schema import (
     SUMMARY,
     metrics_in,
 )
-from alpasim_plugin.run_folder.shapes import REACH_M, RunInfo, SceneFile, Summary
+from alpasim_plugin.run_folder.shapes import RunInfo, SceneFile, Summary
 from alpasim_plugin.run_folder.writer import rollout_table
 
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
-POSITIONS = ("ego_x_m", "ego_y_m")
 TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
 
 
@@ -171,9 +169,7 @@ class Run:
             STEPS_TABLE.check(path)
             self._steps_checked.add(path)
         with parsing(DOING, path, AGAIN, "no readable parquet"):
-            table = pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(columns=list(columns), filter=keep)
-        _check_positions(table, path)
-        return table
+            return pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(columns=list(columns), filter=keep)
 
     @cached_property
     def _steps_checked(self) -> set[Path]:
@@ -193,18 +189,6 @@ class Run:
                 if reasons:
                     found[renderer, metric] = max(reasons, key=lambda reason: reasons[reason])
         return found
-
-
-def _check_positions(steps: pa.Table, path: Path) -> None:
-    """Refuse valid positions of the ego that lie as far away as none in a scene's file may."""
-    if not {"metric", "value", "valid"} <= set(steps.column_names):
-        return
-    at = pc.and_(steps["valid"], pc.is_in(steps["metric"], pa.array(POSITIONS)))
-    far = steps.filter(pc.and_(at, pc.greater(pc.abs(steps["value"]), REACH_M)))
-    if far.num_rows:
-        first = far.slice(0, 1).to_pylist()[0]
-        found = f"{first['metric']} = {first['value']:g} m, wanted at most {REACH_M:,.0f} m from the origin"
-        raise InputError(DOING, f"{path}, {first['scene']}", found, AGAIN)
 
 
 RunT = TypeVar("RunT", bound=Run)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 DOING = "reading a run folder"
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
+LARGEST = 1e15  # of a metric's value: a double holds no thousandths of larger ones, and no picture a thousand times as much
+LATEST_US = 2.0**62  # of a time: the difference of two is one of 64 bits
 VALID = "_valid"  # ends the name of the column that tells where a metric is valid
 
 
@@ -171,10 +173,13 @@ class TableSchema:
 
 
 def columns_of(metrics: Iterable[str], rates: Container[str] = ()) -> list[Column]:
-    """Return the columns of metrics: a number, and a flag that tells whether it is valid; null where a rollout failed."""
+    """Return the columns of metrics: a number, and a flag that tells whether it is valid; null where a rollout failed.
+
+    A number is one that reports can draw (`LARGEST`); one of the ``rates`` is in [0, 1].
+    """
     out: list[Column] = []
     for name in metrics:
-        least, most = (0.0, 1.0) if name in rates else (None, math.inf)
+        least, most = (0.0, 1.0) if name in rates else (-LARGEST, LARGEST)
         out += [Column(name, "number", least=least, most=most), Column(name + VALID, "flag")]
     return out
 
@@ -212,9 +217,9 @@ STEPS_TABLE = TableSchema(
     STEPS,
     (
         *CELL_COLUMNS,
-        Column("t_us", "integer", is_required=True),
+        Column("t_us", "integer", is_required=True, least=-LATEST_US, most=LATEST_US),
         Column("metric", "text", is_required=True),
-        Column("value", "number"),
+        Column("value", "number", least=-LARGEST, most=LARGEST),
         Column("valid", "flag", is_required=True),
         Column("reason", "text"),
         LOG_COLUMN,

@@ -233,8 +233,7 @@ class Summary(TypedDict, total=False):
     plans: dict[str, dict[str, Any]]
 
 
-REACH_M = 1e6  # of a position in a run folder; drives begin near their origin, or in coordinates of a map
-Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
 
 

@@ -13,11 +13,9 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
-    HALF_WIDTH_M,
     arc_lengths,
     densify,
     inverse,
-    lane_polygon,
     project,
     resample,
     transform_points,
@@ -25,6 +23,7 @@ from alpasim_plugin.core.geometry import (
     yaw_from_quat,
     yaw_of,
 )
+from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, I64, LaneMap, Route, Trajectory
 
 VERTEX_STEP_M = 1.0  # the KD-trees hold a centre vertex at least this often

@@ -16,16 +16,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import (
-    interpolate,
-    inverse,
-    lane_polygon,
-    offset_trajectory,
-    quat_from_yaw,
-    rectangle_corners,
-    yaw_from_quat,
-    yaw_of,
-)
+from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, quat_from_yaw, rectangle_corners, yaw_from_quat, yaw_of
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import Preset

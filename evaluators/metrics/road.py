@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import lane_polygons, ring_area
+from alpasim_plugin.core.lane_areas import lane_polygons, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.metrics.border import Borders
 from evaluators.metrics.footprint import Geometries, pairs_of, spans

@@ -22,7 +22,7 @@ LEVEL = 0.95
 TAIL = (1 - LEVEL) / 2
 ROUNDING = 1e-12  # values that differ by no more than this, relative, are equal
 TOO_LARGE = "the values are too large for their spread to be a number"
-LARGE = 1e150  # the squares of larger values are no numbers
+LARGE = 1e150  # the squares of larger values are no numbers, and those of their inverses lose their digits
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
 
 
 def scaled(values: F64) -> tuple[F64, float]:
-    """Return values whose squares are finite, and what to multiply with; 1 but for very large values."""
+    """Return values whose squares are finite and, of their spread, not lost; and what to multiply with: 1 but for extreme values."""
     most = float(np.max(np.abs(values), initial=0.0))
-    scale = most if most > LARGE else 1.0
+    scale = 1.0 if most == 0 or 1 / LARGE <= most <= LARGE else most
     return values / scale, scale
 
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.geometry import lane_polygon, rectangle_corners
+from alpasim_plugin.core.geometry import rectangle_corners
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Lane, LaneMap
 from evaluators import PRESETS, reduce_rollout, score
 from evaluators.metrics import surface

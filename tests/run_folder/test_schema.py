@@ -49,6 +49,7 @@ def changed(column: str, value: Any) -> pa.Table:
         (changed("frames", -1), ", row 2", "column 'frames': a value below 0"),
         (changed("frames", -(2**63)), ", row 2", "column 'frames': a value below 0"),
         (changed("wall_s", -0.5), ", row 2", "column 'wall_s': a value below 0"),
+        (changed("offroad", -1e308), ", row 2", "column 'offroad': a value below -1e+15"),
         (pa.Table.from_pylist([*ROWS, ROWS[0], ROWS[0]]), "", "3 rows of renderer "),
     ],
 )
@@ -68,7 +69,7 @@ def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_ro
         assert caught.value.do_this
 
 
-@pytest.mark.parametrize("value", [-1e308, 1.5])
+@pytest.mark.parametrize("value", [-1e14, 1.5])
 def test_a_rate_outside_its_range_is_refused_by_row(tmp_path: Path, usual_run: Path, value: float) -> None:
     run = shutil.copytree(usual_run, tmp_path / "run")
     pq.write_table(changed("offroad", value), run / "rollouts.parquet")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, lane_polygon, matrix_from_quat, se3, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.geometry import interpolate, matrix_from_quat, se3, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.route import LaneIndex, route_from_log

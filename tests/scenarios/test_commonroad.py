@@ -7,7 +7,8 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, lane_polygon, se3, yaw_from_quat
+from alpasim_plugin.core.geometry import interpolate, se3, yaw_from_quat
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import HeightField
 from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.commonroad import read_commonroad, read_obstacles

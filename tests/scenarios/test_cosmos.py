@@ -10,7 +10,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import densify, inverse, lane_polygon, se3, transform_points, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.geometry import densify, inverse, se3, transform_points, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.cosmos import paint_of, read_cosmos, read_layer, read_poses, sign_pose

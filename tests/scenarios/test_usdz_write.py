@@ -15,7 +15,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import lane_polygon
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
 from scenarios.load import load_scenario
 from scenarios.map_lines import alpasim_view, rails, with_vertices

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify, lane_polygon, lane_polygons
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify
+from alpasim_plugin.core.lane_areas import lane_polygon, lane_polygons
 from alpasim_plugin.core.types import Lane, LaneMap
 from alpasim_plugin.world.route import LaneIndex
 from tests.examples import examples

@@ -20,8 +20,7 @@ from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.core.blank import blank_scenario
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario, Trajectory
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.plugins.parts.build import complete
+from alpasim_plugin.plugins.interfaces import Policy, complete
 
 ADDRESS = "SIMRUN_POLICY_ADDRESS"
 

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, lane_polygon, resample
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, Bool, Lane, Scenario
 

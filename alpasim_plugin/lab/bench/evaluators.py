@@ -19,7 +19,8 @@ import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
-from alpasim_plugin.core.geometry import arc_lengths, lane_polygon
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, RolloutLog, Scene, Trajectory
 from evaluators.metrics.collision import SIDES
 from evaluators.metrics.contact import Contacts, find_contacts, find_swept

@@ -4,7 +4,8 @@ A name is resolved once, into a `PartSpec` that carries the part's identity; a w
 (`alpasim_plugin.plugins.parts.builtin`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
 """
 
-from alpasim_plugin.plugins.parts.build import build, complete
+from alpasim_plugin.plugins.interfaces import complete
+from alpasim_plugin.plugins.parts.build import build
 from alpasim_plugin.plugins.parts.resolve import (
     RendererSpec,
     find,
