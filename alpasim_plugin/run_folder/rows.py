@@ -10,6 +10,7 @@ from typing import Any, overload
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, cell_name, metrics_in
@@ -108,14 +109,14 @@ Series = dict[tuple[str, str, str, int], Own]
 
 
 def series_by_cell(table: pa.Table) -> Series:
-    """Split a step table into valid, time-sorted series.
+    """Split a step table into valid, finite, time-sorted series.
 
     Works on integer codes of the text columns: a run has millions of steps and few names.
 
     Returns:
         cell -> metric -> (``t_us (T,)``, ``value (T,)``).
     """
-    table = table.filter(table["valid"]) if table.num_rows else table
+    table = table.filter(pc.and_(table["valid"], pc.is_finite(table["value"]))) if table.num_rows else table
     if not table.num_rows:
         return {}
     codes, names = zip(*(_coded(table[name]) for name in (*KEYS, "metric")), strict=True)

@@ -250,9 +250,10 @@ def _check_values(path: Path, column: Column, doing: str, do_this: str) -> None:
     if column.least is not None:
         # Arrow compares an integer with a float as floats, and refuses integers that a float does not hold.
         bound = int if column.kind == "integer" else float
-        checks.append((pc.less(values, bound(column.least)), f"a value below {column.least:g}"))
+        known = pc.is_finite(values)  # what is not finite counts as missing
+        checks.append((pc.and_(known, pc.less(values, bound(column.least))), f"a value below {column.least:g}"))
         if math.isfinite(column.most):
-            checks.append((pc.greater(values, bound(column.most)), f"a value above {column.most:g}"))
+            checks.append((pc.and_(known, pc.greater(values, bound(column.most))), f"a value above {column.most:g}"))
     for wrong, found in checks:
         row = pc.index(wrong, True).as_py()
         if row >= 0:

@@ -120,5 +120,6 @@ def test_design_effect_is_the_number_of_seeds_where_seeds_are_copies_and_about_o
     scenes = np.repeat(np.arange(300), 5)
     assert design_effect(np.repeat(rng.normal(size=300), 5), scenes) == pytest.approx(5.0, rel=0.02)
     assert design_effect(rng.normal(size=1500), scenes) == pytest.approx(1.0, abs=0.2)
+    assert design_effect([0.0, 0.0, 1e-308, 0.0], [0, 0, 1, 1]) == pytest.approx(design_effect([0.0, 0.0, 1.0, 0.0], [0, 0, 1, 1]))
     assert design_effect([1.0, 1.0], ["a", "b"]) is None
     assert design_effect([1.0, 2.0], ["a", "a"]) is None
