@@ -32,7 +32,7 @@ def check_policy(
     latency_limit_ms: Annotated[float, Flag("Longest median time of a plan.", min=0.0)] = 100.0,
     as_json: Json = False,
 ) -> None:
-    """Drive a policy through painted situations and name every breach of its contract: shapes, frames, units, time, determinism.
+    """Call a policy in fixed situations and name every breach of its contract: shapes, frames, units, time, determinism.
 
     Nothing is rendered or scored; it takes seconds. Run it before the first drive.
     """

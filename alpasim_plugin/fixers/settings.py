@@ -103,7 +103,7 @@ class DigestSettings(Part):
 class WeightsSettings(Part):
     """Files with weights; relative paths start at the folder of the file that names them, or at the working folder."""
 
-    bundle: str | None = Field(default=None, description="One safetensors file with everything (docs/fixer-weights.md).")
+    bundle: str | None = Field(default=None, description="One safetensors file with everything (docs/fixers.md).")
     dit: str | None = Field(default=None, description="The transformer alone.")
     vae: str | None = Field(default=None, description="The autoencoder alone.")
     decoder: str | None = Field(default=None, description="The tiny Wan decoder.")

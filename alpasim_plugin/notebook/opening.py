@@ -140,7 +140,7 @@ class OpenRollout:
 
     @cached_property
     def steps(self) -> Any:
-        """Give a frame with a column a metric and a row an instant ``t_us``; a metric that is not valid there has no value.
+        """Give a frame with a column for each metric and a row for each instant ``t_us``; a metric that is not valid there has no value.
 
         The index is ``t_us`` in pandas; in polars it is a column.
         """

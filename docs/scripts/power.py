@@ -1,7 +1,7 @@
 """Drive shipped scenes with a driver that looks at nothing, and with those that look: which scenes tell them apart.
 
 python docs/scripts/power.py drive --policy pure-pursuit,lane-camera OUT.json SCENE...
-python docs/scripts/power.py table OUT.json...        # the table of docs/power.md
+python docs/scripts/power.py table OUT.json...        # the table of docs/experiments/power.md
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The methods of `simrun decide` side by side: wrong "non-inferior" with the truth on the margin, and scenes to a right one.
 
-Run: ``python docs/scripts/sequential_methods.py 200`` (runs a cell); it prints the table of docs/sequential.md.
+Run: ``python docs/scripts/sequential_methods.py 200`` (runs a cell); it prints the table of docs/experiments/sequential.md.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def summary_md(run: Run) -> str:
         for r in removed:
             counts = [f"{c.text} ({c.note})" if c.note and c.text != "0" else c.text for c in r.counts]
             body.append([r.renderer, *counts, *(c.text for c in r.bounds)])
-        parts.append(f"\n### Not in the numbers\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
+        parts.append(f"\n### What the numbers leave out\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
     failures, more = failure_rows(run)
     if failures:
         head = ["class", "renderer", "policy", "scene", "seed", "what happened"]

@@ -54,7 +54,7 @@ def metric_lines(decision: Decision) -> list[str]:
         note = "" if row.binding else ", not binding"
         text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
         lines.append(labelled("", text))
-    return [*lines, *(labelled("sure" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
+    return [*lines, *(labelled("error" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
 
 
 def guarantee(decision: Decision) -> list[str]:

@@ -19,8 +19,8 @@ COLUMNS = (  # head, what it means
     ),
     ("frames", "camera frames that went through it"),
     ("hit rate", "share of drafted frames whose true pose came within tolerance"),
-    ("redrafts", "blocks that were made again on the way, per block"),
-    ("shown off by", "largest distance between the camera pose of a frame handed to the policy and the true one"),
+    ("made again", "how often a block was drafted again before it was complete, per block"),
+    ("pose error", "largest distance between the camera pose of a frame handed to the policy and the true one"),
     ("refused", "frames that the guard replaced by the raw frame"),
 )
 

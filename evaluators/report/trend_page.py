@@ -121,7 +121,7 @@ DENSE = 120  # runs; with more, marks and bars would cover one another: lines an
 
 
 def trend_chart(series: Series, metric: str, colours: Mapping[str, int]) -> Chart:
-    """Draw means with their 95 % intervals over the runs of a series, a line a renderer; a ring marks a step that moved the metric.
+    """Draw means with their 95 % intervals over the runs of a series, a line for each renderer. A ring marks a step that moved it.
 
     Args:
         series: Comparable runs.

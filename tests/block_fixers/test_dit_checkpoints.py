@@ -33,7 +33,7 @@ def test_missing_tensor_is_named(key):
         load(sd, source="weights.safetensors")
     assert f"missing: {key}" in caught.value.found
     assert "weights.safetensors" in caught.value.with_what
-    assert "docs/nets.md" in caught.value.do_this
+    assert "docs/block-fixers.md" in caught.value.do_this
 
 
 @pytest.mark.parametrize("key", [key for key in KEYS if key not in SQUARE])

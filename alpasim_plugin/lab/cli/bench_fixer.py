@@ -19,7 +19,7 @@ from alpasim_plugin.lab.bench.fixer_rows import Bench, BenchOptions, Row
 from alpasim_plugin.lab.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 
-PAGE, PICTURE = Path("docs/speed-and-error.md"), Path("docs/img/speed-and-error.png")
+PAGE, PICTURE = Path("docs/experiments/speed-and-error.md"), Path("docs/img/speed-and-error.png")
 EPILOG = """
 Examples:
 

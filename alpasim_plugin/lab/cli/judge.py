@@ -75,7 +75,7 @@ def check(
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Measure how blunt a judge is: against simulator truth, and under rising damage; prints its card."""
+    """Measure how far a judge can be trusted: against simulator truth, and under rising damage; prints its card."""
     del debug
     if name not in CHECKED:
         raise InputError("checking a judge", f"--judge {name}", "no such judge", f"choose one of {', '.join(CHECKED)}")

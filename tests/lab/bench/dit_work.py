@@ -1,6 +1,6 @@
 """Work of the transformer from its sizes alone: what the counts of real code are compared with.
 
-Multiply-adds count as two. Source of the terms: docs/nets.md.
+Multiply-adds count as two. Source of the terms: docs/block-fixers.md.
 """
 
 from __future__ import annotations
