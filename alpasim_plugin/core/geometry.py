@@ -25,8 +25,9 @@ def wrap_angle(angle_rad: npt.ArrayLike) -> F64:
 def quat_from_yaw(yaw_rad: npt.ArrayLike) -> F64:
     """Return ``(..., 4)`` unit quaternions of rotations about z by ``(...)`` angles."""
     yaw = np.asarray(yaw_rad, dtype=np.float64)
-    zero = np.zeros_like(yaw)
-    return np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=-1)
+    quat = np.zeros((*yaw.shape, 4))
+    quat[..., 0], quat[..., 3] = np.cos(yaw / 2), np.sin(yaw / 2)
+    return quat
 
 
 def yaw_from_quat(quat: npt.ArrayLike) -> F64:
@@ -37,13 +38,13 @@ def yaw_from_quat(quat: npt.ArrayLike) -> F64:
 
 def matrix_from_quat(quat: npt.ArrayLike) -> F64:
     """Return rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
-    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    q = np.asarray(quat, dtype=np.float64)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    m = np.empty((*q.shape[:-1], 3, 3))
+    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return m
 
 
 def quat_from_matrix(rotation: npt.ArrayLike) -> F64:

@@ -103,11 +103,11 @@ class Outcome:
 
 
 def make_work(work: Path) -> None:
-    """Fill a folder with a finished run of two renderers, which needs no camera and so no kernel."""
+    """Fill a folder with a finished run of two policies, which need no camera and so no kernel."""
     for name in ("home", "tmp", "out"):
         (work / name).mkdir()
     drive = [*DRIVE, "--seeds", "2", "--workers", "1", "--out", str(work / "runs" / "one"), "smoke/straight"]
-    drive[drive.index("clean")] = "clean,3dgs"
+    drive[drive.index("constant-velocity")] = "constant-velocity,pure-pursuit"
     done = subprocess.run([sys.executable, "-m", "alpasim_plugin.cli.main", *drive], capture_output=True, text=True, cwd=REPO)
     assert done.returncode == 0, done.stderr
 
