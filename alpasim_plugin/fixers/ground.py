@@ -59,7 +59,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, boxes: Mapping[str, B
         better = _disagreement(*by_ground[:2], size) <= _disagreement(*own, size) + PREFERENCE
         ground &= better | (target.depth[lower] <= 0)
     for image, on_ground in zip(by_depth, by_ground, strict=True):
-        image[lower][ground] = on_ground[ground]
+        cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
     return tuple(by_depth)
 
 
