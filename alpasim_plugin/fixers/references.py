@@ -1,4 +1,4 @@
-"""Recorded frames as references of a fixer: which of them a frame is given. `fixers.warp` carries them into its view.
+"""Recorded frames as references of a fixer: which of them a frame is given. `fixers.ground` carries them into its view.
 
 Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph, carried into the view by the render's
 own depth and by the poses that the reconstruction believes; pixels of a road user move with its box. Both are as wrong as the
@@ -17,7 +17,8 @@ from typing import Literal
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, warp
+from alpasim_plugin.fixers.ground import carry
+from alpasim_plugin.fixers.warp import Picture, WarpTarget
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
 SECOND_M, TURN_M = 0.5, 10.0  # a second apart counts as so many metres, and so does a view that is turned by a radian
@@ -104,8 +105,8 @@ class ReferenceSession:
         chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
         if self.hysteresis:
             self._last[frame.camera] = chosen
-        target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors)
-        return tuple(warp(self._picture(i), target, self._boxes) for i in chosen)
+        target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors, request.camera.T_rig_camera)
+        return carry([self._picture(i) for i in chosen], target, self._boxes)
 
     def _picture(self, i: int) -> Picture:
         if i not in self._pictures:

@@ -32,12 +32,14 @@ class WarpTarget:
         T_world_camera: ``(4, 4)``.
         depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as infinitely far.
         actors: ``T_world_box`` of the actors present.
+        T_rig_camera: ``(4, 4)``; the plane z = 0 of the rig is the ground below it. None: not known.
     """
 
     K: F64
     T_world_camera: F64
     depth: F32
     actors: Mapping[str, F64]
+    T_rig_camera: F64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,7 @@ class Picture:
     actors: Mapping[str, F64]
 
 
-def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
+def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_share: float | None = None) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
     A pixel's surface point is moved with the box it lies in, from where the actor is now to where it was when the frame was recorded, and
@@ -61,20 +63,20 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
         picture: The recorded frame.
         target: The view.
         boxes: Sizes of the actors.
+        free_share: None, or the view's depth is that of the ground, which the recorded frame shows wherever its own depth is at least this
+            share of the point's.
 
     Returns:
         ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with the point, `INCONSISTENT` where it does
         not (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to
         an actor that was not there.
     """
-    now = [name for name in sorted(target.actors) if name in boxes]
+    now, T_box_world, sizes = placed_boxes(target.actors, boxes)
     absent = np.full((4, 4), np.nan)
-    T_box_world = np.array([inverse(target.actors[name]) for name in now]).reshape(-1, 4, 4)
     T_then_box = np.array([picture.actors.get(name, absent) for name in now]).reshape(-1, 4, 4)
-    sizes = np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
     T_then_world = inverse(picture.T_world_camera)
     x, y, held = warp_coordinates(
-        target.depth, target.K, target.T_world_camera, picture.K, T_then_world, picture.depth, T_box_world, T_then_box, sizes
+        target.depth, target.K, target.T_world_camera, picture.K, T_then_world, picture.depth, T_box_world, T_then_box, sizes, free_share
     )
     out = np.empty((*held.shape, 4), np.uint8)
     out[..., :3] = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -82,8 +84,24 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box]) -> U8:
     return out
 
 
+def placed_boxes(actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> tuple[list[str], F64, F64]:
+    """Return names, ``T_box_world (A, 4, 4)`` and sizes ``(A, 3)`` of the actors that have a box."""
+    now = [name for name in sorted(actors) if name in boxes]
+    T_box_world = np.array([inverse(actors[name]) for name in now]).reshape(-1, 4, 4)
+    return now, T_box_world, np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
+
+
 def warp_coordinates(
-    depth: F32, K: F64, T_world_camera: F64, K_then: F64, T_then_world: F64, depth_then: F32, T_box_world: F64, T_then_box: F64, sizes: F64
+    depth: F32,
+    K: F64,
+    T_world_camera: F64,
+    K_then: F64,
+    T_then_world: F64,
+    depth_then: F32,
+    T_box_world: F64,
+    T_then_box: F64,
+    sizes: F64,
+    free_share: float | None = None,
 ) -> tuple[F32, F32, U8]:
     """Return where every pixel of a view is to be looked up in a recorded frame, and how well that holds.
 
@@ -95,6 +113,7 @@ def warp_coordinates(
         T_box_world: ``(A, 4, 4)`` the world to each actor's box, at the view's time.
         T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the actor was absent.
         sizes: ``(A, 3)`` length, width and height, metres.
+        free_share: See `warp`.
 
     Returns:
         Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`, `INCONSISTENT` or 0 ``(H, W)``.
@@ -108,12 +127,13 @@ def warp_coordinates(
     arrays = (
         np.ascontiguousarray(part, dtype=np.float64) for part in (A, b, ray, T_world_camera[:3, 3], project, T_box_world, T_then_box, sizes)
     )
-    _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, x, y, held)
+    share = np.inf if free_share is None else free_share
+    _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, share, x, y, held)
     return x, y, held
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, sizes, x, y, held):
+def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, sizes, free_share, x, y, held):
     """Fill ``x``, ``y`` and ``held``; the loop of `plain_coordinates`."""
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
@@ -130,7 +150,7 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
                 px = z * (ray[0, 0] * u0 + ray[0, 1] * v0 + ray[0, 2]) + eye[0]
                 py = z * (ray[1, 0] * u0 + ray[1, 1] * v0 + ray[1, 2]) + eye[1]
                 pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
-                a = _box_around(px, py, pz, T_box, sizes)
+                a = box_around(px, py, pz, T_box, sizes)
                 if a >= 0:
                     W, B = T_then_box[a], T_box[a]
                     if not np.isfinite(W[0, 0]):
@@ -153,11 +173,12 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
             there = np.float64(depth_then[int(v), int(u)])
             there = there if there > 0 else np.float64(INFINITY_M)
             far = there > INFINITY_M / 2 and rz > INFINITY_M / 2
-            held[row, column] = VALID if far or abs(there - rz) < SLACK * rz + SLACK_M else INCONSISTENT
+            agrees = far or there >= free_share * rz or abs(there - rz) < SLACK * rz + SLACK_M
+            held[row, column] = VALID if agrees else INCONSISTENT
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _box_around(px, py, pz, T_box, sizes):
+def box_around(px, py, pz, T_box, sizes):
     """Return the first box that a point of the world lies in; -1: none."""
     for a in range(sizes.shape[0]):
         B = T_box[a]
@@ -172,7 +193,16 @@ def _box_around(px, py, pz, T_box, sizes):
 
 
 def plain_coordinates(
-    depth: F32, K: F64, T_world_camera: F64, K_then: F64, T_then_world: F64, depth_then: F32, T_box_world: F64, T_then_box: F64, sizes: F64
+    depth: F32,
+    K: F64,
+    T_world_camera: F64,
+    K_then: F64,
+    T_then_world: F64,
+    depth_then: F32,
+    T_box_world: F64,
+    T_then_box: F64,
+    sizes: F64,
+    free_share: float | None = None,
 ) -> tuple[F32, F32, U8]:
     """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
     height, width = depth.shape
@@ -200,6 +230,8 @@ def plain_coordinates(
     then = np.where(at > 0, at, INFINITY_M)
     far = (then > INFINITY_M / 2) & (rz > INFINITY_M / 2)
     agrees = far | (np.abs(then - rz) < SLACK * rz + SLACK_M)
+    if free_share is not None:
+        agrees |= then >= free_share * rz
     held = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0).astype(np.uint8)
     return np.where(seen, x - 0.5, 0).astype(np.float32), np.where(seen, y - 0.5, 0).astype(np.float32), held
 

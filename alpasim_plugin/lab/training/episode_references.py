@@ -15,8 +15,9 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, U8, Box
+from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.references import ReferenceIndex
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, warp
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 
@@ -80,9 +81,11 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
         last = recorded.choose(references.T_world_camera[i], t_us, wanted + 1, last)
         chosen = [j for j in last if references.rgb_t_us[j] != t_us][:wanted]  # a photograph is not its own reference
         target = references.target(int(i), K, rows, columns)
-        for slot, j in enumerate(chosen[draw.skipped :]):
-            at = (j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j
-            out[t, slot] = warp(_misplaced(_picture(sequence, at), draw.errors[slot]), target, boxes)
+        used = chosen[draw.skipped :]
+        places = [(j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j for slot, j in enumerate(used)]
+        pictures = [_misplaced(_picture(sequence, at), error) for at, error in zip(places, draw.errors, strict=False)]
+        for slot, carried in enumerate(carry(pictures, target, boxes)):
+            out[t, slot] = carried
     return out
 
 

@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
+from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.references import ReferenceIndex
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, warp
+from alpasim_plugin.fixers.warp import Picture, WarpTarget
 from alpasim_plugin.io.reading.arrays import open_npy
 from alpasim_plugin.lab.training.pair_store import READING, PairSequence
 
@@ -41,6 +42,7 @@ class SequenceReferences:
     """The recorded frames of one sequence, as memory maps."""
 
     K: F64
+    T_rig_camera: F64  # (4, 4)
     T_world_camera: F64  # (T, 4, 4) of the frames
     t_us: I64
     depth: F16  # (T, H, W)
@@ -64,11 +66,12 @@ class SequenceReferences:
         for i in range(frames):
             last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
             target = self.target(i, self.K, whole, whole)
-            yield tuple(warp(self.picture(j), target, sizes) for j in last)
+            yield carry([self.picture(j) for j in last], target, sizes)
 
     def target(self, i: int, K: F64, rows: slice, columns: slice) -> WarpTarget:
         """Return a crop of frame ``i`` as a view; ``K`` is that of the crop."""
-        return WarpTarget(K, self.T_world_camera[i], self.depth[i, rows, columns].astype(np.float32), _named(self.actors[i]))
+        depth = self.depth[i, rows, columns].astype(np.float32)
+        return WarpTarget(K, self.T_world_camera[i], depth, _named(self.actors[i]), self.T_rig_camera)
 
     def picture(self, i: int) -> Picture:
         """Return recorded frame ``i``."""
@@ -122,8 +125,8 @@ def open_references(sequence: PairSequence) -> SequenceReferences | None:
     if len(opened[0]) < len(clip) or len({len(array) for array in opened[3:]}) != 1:
         found = f"{len(opened[0])} depths of {len(clip)} frames, recorded frames {[len(array) for array in opened[3:]]}"
         raise InputError(READING, str(folder / FOLDER), found, "remove the folder and run 'simrun train pairs' again")
-    K = np.array(sequence.info["camera"]["K"], dtype=np.float64)
-    return SequenceReferences(K, clip.T_world_camera, clip.t_us, *opened)
+    K, T_rig_camera = (np.array(sequence.info["camera"][name], dtype=np.float64) for name in ("K", "T_rig_camera"))
+    return SequenceReferences(K, T_rig_camera, clip.T_world_camera, clip.t_us, *opened)
 
 
 def _poses(frames: Sequence[Mapping[str, F64]], names: Sequence[str]) -> F64:

@@ -1,0 +1,126 @@
+"""Recorded frames carried into a view by two hypotheses of its depth: the render's own, and the ground.
+
+A poor reconstruction has holes and mist above the road in front of the car, where a recorded frame shows the road itself. The rig stands on
+the ground, so the depth of the ground is known wherever a ray meets the plane z = 0 of the rig. Of the two depths of a pixel the one counts
+with which two recorded frames agree: plane-sweeping stereo (Collins, 1996, "A space-sweep approach to true multi-image matching") with two
+hypotheses a pixel. Where they agree equally well, or where only one frame is there, the ground is preferred.
+"""
+
+# Numba's decorators are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numba import njit
+
+from alpasim_plugin.core.types import F32, U8, Bool, Box
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, box_around, placed_boxes, warp
+
+NEAREST_M, FARTHEST_M = 0.5, 120.0  # depths in which the road is taken for the plane below the rig
+FREE_SHARE = 0.4  # a surface nearer than this share of the ground's depth stands above the ground for certain
+WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
+PREFERENCE = 3.0  # grey levels by which the ground may agree less than the render's depth does
+GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
+UNSEEN = 30.0  # grey levels: the disagreement of a pixel that one of the two frames does not show
+
+
+def carry(pictures: Sequence[Picture], target: WarpTarget, boxes: Mapping[str, Box]) -> tuple[U8, ...]:
+    """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of every pixel.
+
+    Args:
+        pictures: Recorded frames, nearest first; the first two are compared.
+        target: The view. Without ``T_rig_camera`` the render's depth alone counts.
+        boxes: Sizes of the actors; what lies in the box of one keeps the render's depth.
+
+    Returns:
+        For each picture ``(H, W, 4)`` uint8: see `warp`.
+    """
+    by_depth = [warp(picture, target, boxes) for picture in pictures]
+    if target.T_rig_camera is None or not pictures:
+        return tuple(by_depth)
+    depth = ground_hypothesis(target, boxes)
+    rows = np.flatnonzero(depth.any(axis=1))
+    if not len(rows):
+        return tuple(by_depth)
+    lower = slice(int(rows[0]), len(depth))
+    K = target.K.copy()
+    K[1, 2] -= lower.start
+    view = replace(target, K=K, depth=depth[lower], actors={})
+    by_ground = [warp(picture, view, boxes, FREE_SHARE) for picture in pictures]
+    ground = view.depth > 0
+    if len(pictures) > 1:
+        size = max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
+        own = [image[lower] for image in by_depth[:2]]
+        better = _disagreement(*by_ground[:2], size) <= _disagreement(*own, size) + PREFERENCE
+        ground &= better | (target.depth[lower] <= 0)
+    for image, on_ground in zip(by_depth, by_ground, strict=True):
+        cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
+    return tuple(by_depth)
+
+
+def ground_hypothesis(target: WarpTarget, boxes: Mapping[str, Box]) -> F32:
+    """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of the view may show it; elsewhere 0.
+
+    It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
+    nearer than `FREE_SHARE` of that and does not lie in an actor's box.
+    """
+    assert target.T_rig_camera is not None
+    _, T_box_world, sizes = placed_boxes(target.actors, boxes)
+    # A pixel p at depth z lies at the height z (down . p) + height above the ground.
+    down = target.T_rig_camera[2, :3] @ np.linalg.inv(target.K)
+    ray = np.ascontiguousarray(target.T_world_camera[:3, :3] @ np.linalg.inv(target.K))
+    out = np.zeros(target.depth.shape, np.float32)
+    eye, height_m = np.ascontiguousarray(target.T_world_camera[:3, 3]), float(target.T_rig_camera[2, 3])
+    _ground(np.ascontiguousarray(target.depth), down, height_m, ray, eye, T_box_world, sizes, out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ground(depth, down, height_m, ray, eye, T_box, sizes, out):
+    """Fill ``out``; the loop of `plain_ground_hypothesis`."""
+    for row in range(depth.shape[0]):
+        v = row + 0.5
+        for column in range(depth.shape[1]):
+            u = column + 0.5
+            z = -height_m / (down[0] * u + down[1] * v + down[2])
+            if not NEAREST_M < z < FARTHEST_M:
+                continue
+            seen = np.float64(depth[row, column])
+            if seen > 0:
+                if seen < FREE_SHARE * z:
+                    continue
+                px = seen * (ray[0, 0] * u + ray[0, 1] * v + ray[0, 2]) + eye[0]
+                py = seen * (ray[1, 0] * u + ray[1, 1] * v + ray[1, 2]) + eye[1]
+                pz = seen * (ray[2, 0] * u + ray[2, 1] * v + ray[2, 2]) + eye[2]
+                if box_around(px, py, pz, T_box, sizes) >= 0:
+                    continue
+            out[row, column] = z
+
+
+def plain_ground_hypothesis(target: WarpTarget, boxes: Mapping[str, Box]) -> F32:
+    """Return the same as `ground_hypothesis`, array by array: the reference of its kernel."""
+    assert target.T_rig_camera is not None
+    height, width = target.depth.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    K, T = target.K, target.T_rig_camera
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    with np.errstate(divide="ignore"):
+        z = -T[2, 3] / (rays @ T[2, :3])
+    may: Bool = (z > NEAREST_M) & (z < FARTHEST_M) & ((target.depth <= 0) | (target.depth >= FREE_SHARE * z))
+    points = (rays * target.depth[..., None]) @ target.T_world_camera[:3, :3].T + target.T_world_camera[:3, 3]
+    _, T_box_world, sizes = placed_boxes(target.actors, boxes)
+    for row, column in np.argwhere(may & (target.depth > 0)):
+        may[row, column] = box_around(*points[row, column], T_box_world, sizes) < 0
+    return np.where(may, z, 0).astype(np.float32)
+
+
+def _disagreement(a: U8, b: U8, size: int) -> F32:
+    """Return by how many grey levels two warped frames differ around each pixel ``(H, W)``."""
+    apart = cv2.transform(cv2.absdiff(a, b), GREY).astype(np.float32)
+    apart[(a[..., 3] == 0) | (b[..., 3] == 0)] = UNSEEN
+    return np.asarray(cv2.blur(apart, (size, size)), np.float32)

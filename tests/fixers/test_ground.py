@@ -1,0 +1,111 @@
+"""Recorded frames by two hypotheses of depth: the road shows where the render has a hole, and what stands on it keeps its own depth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import F32, F64, U8, Box
+from alpasim_plugin.fixers.ground import carry, ground_hypothesis, plain_ground_hypothesis
+from alpasim_plugin.fixers.warp import VALID, Picture, WarpTarget, warp
+
+WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
+K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
+FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]])
+NOBODY: Mapping[str, F64] = {}
+
+
+def rays(T_world_camera: F64) -> F64:
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    local = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    return np.asarray(local @ T_world_camera[:3, :3].T)
+
+
+def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
+    """Pose, depth and picture of a road with a pattern that is fixed to the world, and of a wall across it with another."""
+    T = se2(x_m, 0.0, 0.0) @ FORWARD
+    along = rays(T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(along[..., 2] < 0, -HEIGHT_M / along[..., 2], np.inf)
+    walled = depth > wall_m - x_m
+    depth = np.where(walled, wall_m - x_m, depth)
+    here = T[:3, 3] + along * np.where(np.isfinite(depth), depth, 0)[..., None]
+    grey = 128 + 60 * np.sin(1.3 * here[..., 0]) * np.cos(1.1 * here[..., 1]) + 60 * walled * np.sin(2.0 * here[..., 2])
+    grey[~np.isfinite(depth)] = 230
+    rgb = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    return T, np.where(np.isfinite(depth), depth, 0).astype(np.float32), rgb
+
+
+def recorded(x_m: float, wall_m: float = np.inf) -> Picture:
+    T, depth, rgb = street(x_m, wall_m)
+    return Picture(K, T, rgb, depth, NOBODY)
+
+
+def off(image: U8, truth: U8, where: tuple[slice, slice]) -> float:
+    return float(np.abs(image[..., :3].astype(float) - truth)[where].mean())
+
+
+@pytest.mark.parametrize("fog_m", [0.0, 30.0], ids=["a hole", "mist behind the road"])
+def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
+    T, depth, truth = street(10.0)
+    road = (slice(22, 40), slice(8, 56))
+    depth[road] = fog_m
+    view = WarpTarget(K, T, depth, NOBODY, FORWARD)
+    pictures = [recorded(9.0), recorded(8.0)]
+    for image in carry(pictures, view, {}):
+        assert off(image, truth, road) < 6
+        assert (image[road][..., 3] == VALID).mean() > 0.9
+    assert off(warp(pictures[0], view, {}), truth, road) > 20
+
+
+def test_a_wall_beyond_which_the_plane_goes_on_keeps_its_own_depth() -> None:
+    T, depth, truth = street(10.0, wall_m=20.0)
+    wall = (slice(18, 23), slice(8, 56))  # the ground of these pixels lies up to four times as far
+    assert (ground_hypothesis(WarpTarget(K, T, depth, NOBODY, FORWARD), {})[20:23] > 11).any()
+    pictures = [recorded(7.0, 20.0), recorded(5.0, 20.0)]
+    out = carry(pictures, WarpTarget(K, T, depth, NOBODY, FORWARD), {})
+    by_depth = [warp(picture, WarpTarget(K, T, depth, NOBODY), {}) for picture in pictures]
+    for image, own in zip(out, by_depth, strict=True):
+        assert off(image, truth, wall) < off(own, truth, wall) + 3
+
+
+def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
+    T, depth, _ = street(0.0)
+    car, box = se2(8.0, 0.0, 0.0, 0.75), {"car": Box(4.0, 2.0, 1.5)}
+    rear = (slice(18, 24), slice(30, 34))
+    depth[rear] = 6.0
+    free = ground_hypothesis(WarpTarget(K, T, depth, NOBODY, FORWARD), box)
+    held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}, FORWARD), box)
+    assert (free[22:24, 30:34] > 0).all()
+    assert (held[rear] == 0).all()
+    aside = np.ones(depth.shape, bool)
+    aside[rear] = False
+    np.testing.assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
+
+
+def test_without_the_rig_the_depth_of_the_render_alone_counts() -> None:
+    T, depth, _ = street(10.0)
+    depth[22:40] = 0
+    view, pictures = WarpTarget(K, T, depth, NOBODY), [recorded(9.0), recorded(8.0)]
+    for image, picture in zip(carry(pictures, view, {}), pictures, strict=True):
+        np.testing.assert_array_equal(image, warp(picture, view, {}))
+    assert carry([], view, {}) == ()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth = np.exp(rng.uniform(-4, 9, (HEIGHT, WIDTH))).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    T_rig_camera = se2(*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)) @ FORWARD
+    T_rig_camera[2, 3] = rng.choice([-1.0, 0.0, 1e-9, 1.5, 400.0])  # below the ground, on it, and of a helicopter
+    actors = {f"{i}": se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(0, 4)))}
+    boxes = {name: Box(*rng.uniform(0.3, 6.0, 3)) for name in actors}
+    view = WarpTarget(K, se2(0.0, 0.0, 0.0) @ FORWARD, depth, actors, T_rig_camera)
+    fast, plain = ground_hypothesis(view, boxes), plain_ground_hypothesis(view, boxes)
+    assert ((fast > 0) != (plain > 0)).mean() <= 1e-3  # a point exactly on a border may fall to either side
+    both = (fast > 0) & (plain > 0)
+    np.testing.assert_allclose(fast[both], plain[both], rtol=1e-5)
