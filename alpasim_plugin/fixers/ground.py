@@ -16,17 +16,20 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from alpasim_plugin.core.types import F32, U8, Bool, Box
 from alpasim_plugin.fixers.warp import Picture, WarpTarget, box_around, placed_boxes, warp
 
+I32 = npt.NDArray[np.int32]
+
 NEAREST_M, FARTHEST_M = 0.5, 120.0  # depths in which the road is taken for the plane below the rig
 FREE_SHARE = 0.4  # a surface nearer than this share of the ground's depth stands above the ground for certain
 WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
-PREFERENCE = 3.0  # grey levels by which the ground may agree less than the render's depth does
+PREFERENCE = 3  # grey levels by which the ground may agree less than the render's depth does
 GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
-UNSEEN = 30.0  # grey levels: the disagreement of a pixel that one of the two frames does not show
+UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
 def carry(pictures: Sequence[Picture], target: WarpTarget, boxes: Mapping[str, Box]) -> tuple[U8, ...]:
@@ -56,7 +59,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, boxes: Mapping[str, B
     if len(pictures) > 1:
         size = max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
         own = [image[lower] for image in by_depth[:2]]
-        better = _disagreement(*by_ground[:2], size) <= _disagreement(*own, size) + PREFERENCE
+        better = _disagreement(by_ground[0], by_ground[1], size) <= _disagreement(own[0], own[1], size) + PREFERENCE * size**2
         ground &= better | (target.depth[lower] <= 0)
     for image, on_ground in zip(by_depth, by_ground, strict=True):
         cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
@@ -119,8 +122,11 @@ def plain_ground_hypothesis(target: WarpTarget, boxes: Mapping[str, Box]) -> F32
     return np.where(may, z, 0).astype(np.float32)
 
 
-def _disagreement(a: U8, b: U8, size: int) -> F32:
-    """Return by how many grey levels two warped frames differ around each pixel ``(H, W)``."""
-    apart = cv2.transform(cv2.absdiff(a, b), GREY).astype(np.float32)
+def _disagreement(a: U8, b: U8, size: int) -> I32:
+    """Return by how many grey levels two warped frames differ, summed over the window around each pixel ``(H, W)``.
+
+    Whole numbers, because a running sum of fractions would depend on how OpenCV splits the picture among its threads.
+    """
+    apart = cv2.transform(cv2.absdiff(a, b), GREY)
     apart[(a[..., 3] == 0) | (b[..., 3] == 0)] = UNSEEN
-    return np.asarray(cv2.blur(apart, (size, size)), np.float32)
+    return np.asarray(cv2.boxFilter(apart, cv2.CV_32S, (size, size), normalize=False), np.int32)

@@ -212,7 +212,12 @@ class PixelFixer(Fixer):
 def trust(state: PixelState) -> dict[str, float]:
     """Return where the last output comes from, as facts of its frame."""
     own = (state.output - state.render).abs_().mean(dim=-1, keepdim=True).mul_(1 / MADE_UP).clamp_(max=1)
-    return {RECORDED: float(state.recorded.mean()), GUESSED: float((own * (1 - state.recorded)).mean())}
+    return {RECORDED: _mean(state.recorded), GUESSED: _mean(own * (1 - state.recorded))}
+
+
+def _mean(values: Tensor) -> float:
+    """Return the mean on one thread: torch's depends in its last bits on the number of threads, and facts must not."""
+    return float(values.cpu().numpy().mean(dtype=np.float64))
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:
