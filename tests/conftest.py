@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -86,6 +86,18 @@ def shared_data() -> Path:
     if folder is None:
         pytest.skip("third-party data sets absent (set SIMRUN_SHARED_DATA to their folder)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def data_set(shared_data: Path) -> Callable[[str], Path]:
+    """Give what returns one of the data sets by its folder's name, or skips."""
+
+    def found(name: str) -> Path:
+        if not (shared_data / name).is_dir():
+            pytest.skip(f"the data set {shared_data / name} is absent")
+        return shared_data / name
+
+    return found
 
 
 @pytest.fixture(scope="session")

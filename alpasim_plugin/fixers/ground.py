@@ -1,6 +1,6 @@
 """Recorded frames carried into a view by two hypotheses of its depth: the render's own, and the ground.
 
-A poor reconstruction has holes and mist above the road in front of the car, where a recorded frame shows the road itself. The rig stands on
+A poor reconstruction has holes and mist above the road in front of the car, where a recorded frame shows the road itself. A rig stands on
 the ground, so the depth of the ground is known wherever a ray meets the plane z = 0 of the rig. Of the two depths of a pixel the one counts
 with which two recorded frames agree: plane-sweeping stereo (Collins, 1996, "A space-sweep approach to true multi-image matching") with two
 hypotheses a pixel. Where they agree equally well, or where only one frame is there, the ground is preferred.
@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from alpasim_plugin.core.types import F32, U8, Bool, Box
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, box_around, placed_boxes, warp
+from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, box_around, placed_boxes, plain_box_around, plain_points, warp
 
 I32 = npt.NDArray[np.int32]
 
@@ -32,23 +32,22 @@ GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
-def carry(pictures: Sequence[Picture], target: WarpTarget, boxes: Mapping[str, Box]) -> tuple[U8, ...]:
+def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> tuple[U8, ...]:
     """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of every pixel.
 
     Args:
         pictures: Recorded frames, nearest first; the first two are compared.
-        target: The view. Without ``T_rig_camera`` the render's depth alone counts.
+        target: The view.
+        T_world_rig: ``(4, 4)`` of a rig near the view; the plane z = 0 of it is the ground.
         boxes: Sizes of the actors; what lies in the box of one keeps the render's depth.
 
     Returns:
         For each picture ``(H, W, 4)`` uint8: see `warp`.
     """
     by_depth = [warp(picture, target, boxes) for picture in pictures]
-    if target.T_rig_camera is None or not pictures:
-        return tuple(by_depth)
-    depth = ground_hypothesis(target, boxes)
+    depth = ground_hypothesis(target, T_world_rig, boxes)
     rows = np.flatnonzero(depth.any(axis=1))
-    if not len(rows):
+    if not by_depth or not len(rows):
         return tuple(by_depth)
     lower = slice(int(rows[0]), len(depth))
     K = target.K.copy()
@@ -66,20 +65,21 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, boxes: Mapping[str, B
     return tuple(by_depth)
 
 
-def ground_hypothesis(target: WarpTarget, boxes: Mapping[str, Box]) -> F32:
+def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> F32:
     """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of the view may show it; elsewhere 0.
 
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
-    nearer than `FREE_SHARE` of that and does not lie in an actor's box.
+    nearer than `FREE_SHARE` of that and does not lie in an actor's box. Arguments as of `carry`.
     """
-    assert target.T_rig_camera is not None
     _, T_box_world, sizes = placed_boxes(target.actors, boxes)
-    # A pixel p at depth z lies at the height z (down . p) + height above the ground.
-    down = target.T_rig_camera[2, :3] @ np.linalg.inv(target.K)
-    ray = np.ascontiguousarray(target.T_world_camera[:3, :3] @ np.linalg.inv(target.K))
+    # A pixel p at depth z lies at z ray p + eye in the world, and so at the height z (down . p) + height_m above the ground.
+    ray, eye = (
+        np.ascontiguousarray(target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)),
+        np.ascontiguousarray(target.T_world_camera[:3, 3]),
+    )
+    up = T_world_rig[:3, 2]
     out = np.zeros(target.depth.shape, np.float32)
-    eye, height_m = np.ascontiguousarray(target.T_world_camera[:3, 3]), float(target.T_rig_camera[2, 3])
-    _ground(np.ascontiguousarray(target.depth), down, height_m, ray, eye, T_box_world, sizes, out)
+    _ground(np.ascontiguousarray(target.depth), up @ ray, float(up @ (eye - T_world_rig[:3, 3])), ray, eye, T_box_world, sizes, out)
     return out
 
 
@@ -105,27 +105,22 @@ def _ground(depth, down, height_m, ray, eye, T_box, sizes, out):
             out[row, column] = z
 
 
-def plain_ground_hypothesis(target: WarpTarget, boxes: Mapping[str, Box]) -> F32:
+def plain_ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> F32:
     """Return the same as `ground_hypothesis`, array by array: the reference of its kernel."""
-    assert target.T_rig_camera is not None
-    height, width = target.depth.shape
-    v, u = np.mgrid[:height, :width] + 0.5
-    K, T = target.K, target.T_rig_camera
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    with np.errstate(divide="ignore"):
-        z = -T[2, 3] / (rays @ T[2, :3])
-    may: Bool = (z > NEAREST_M) & (z < FARTHEST_M) & ((target.depth <= 0) | (target.depth >= FREE_SHARE * z))
-    points = (rays * target.depth[..., None]) @ target.T_world_camera[:3, :3].T + target.T_world_camera[:3, 3]
+    one_m = plain_points(np.ones_like(target.depth), target.K, target.T_world_camera)
+    up, eye = T_world_rig[:3, 2], target.T_world_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = up @ (T_world_rig[:3, 3] - eye) / ((one_m - eye) @ up)
     _, T_box_world, sizes = placed_boxes(target.actors, boxes)
-    for row, column in np.argwhere(may & (target.depth > 0)):
-        may[row, column] = box_around(*points[row, column], T_box_world, sizes) < 0
+    boxed = plain_box_around(plain_points(target.depth, target.K, target.T_world_camera), T_box_world, sizes) >= 0
+    may: Bool = (z > NEAREST_M) & (z < FARTHEST_M) & ((target.depth <= 0) | ((target.depth >= FREE_SHARE * z) & ~boxed))
     return np.where(may, z, 0).astype(np.float32)
 
 
 def _disagreement(a: U8, b: U8, size: int) -> I32:
     """Return by how many grey levels two warped frames differ, summed over the window around each pixel ``(H, W)``.
 
-    Whole numbers, because a running sum of fractions would depend on how OpenCV splits the picture among its threads.
+    Whole numbers: their sum is the same in any order.
     """
     apart = cv2.transform(cv2.absdiff(a, b), GREY)
     apart[(a[..., 3] == 0) | (b[..., 3] == 0)] = UNSEEN

@@ -192,7 +192,7 @@ def fixed_renderer(
     scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
     references = None
     if settings.references and recorded:
-        references = ReferenceSession(recorded, scenario.actors, settings.references, settings.recording)
+        references = ReferenceSession(recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording)
     runner = BlockRunner(render, scene_map, scenario.actors, threads, references)
 
     def make() -> Fixer:

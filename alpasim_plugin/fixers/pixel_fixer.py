@@ -217,7 +217,7 @@ def trust(state: PixelState) -> dict[str, float]:
 
 def _mean(values: Tensor) -> float:
     """Return the mean on one thread: torch's depends in its last bits on the number of threads, and facts must not."""
-    return float(values.cpu().numpy().mean(dtype=np.float64))
+    return float(values.cpu().float().numpy().mean(dtype=np.float64))
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:

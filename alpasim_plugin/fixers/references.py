@@ -16,7 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest
+from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest, Trajectory
 from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.warp import Picture, WarpTarget
 
@@ -72,6 +73,7 @@ class ReferenceSession:
     Args:
         recorded: What the renderer declares.
         actors: The scenario's, for the sizes of their boxes.
+        ego_log: Of the rig; the ground of a view is that of the pose nearest to its camera.
         count: References of a frame, at most.
         which: ``all`` of the recording, or only what was recorded before the frame's time.
         hysteresis: Whether a camera keeps its references a little longer than they are nearest. Without it the references of a view do not
@@ -82,12 +84,13 @@ class ReferenceSession:
         self,
         recorded: Sequence[RecordedFrame],
         actors: Sequence[Actor],
+        ego_log: Trajectory,
         count: int,
         which: Literal["all", "past"] = "all",
         hysteresis: bool = True,
     ) -> None:
         self.index, self.count, self.past, self.hysteresis = ReferenceIndex(recorded), count, which == "past", hysteresis
-        self._boxes = {actor.actor_id: actor.box for actor in actors}
+        self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
         self._last: dict[str, tuple[int, ...]] = {}
         self._pictures: OrderedDict[int, Picture] = OrderedDict()
 
@@ -105,8 +108,10 @@ class ReferenceSession:
         chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
         if self.hysteresis:
             self._last[frame.camera] = chosen
-        target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors, request.camera.T_rig_camera)
-        return carry([self._picture(i) for i in chosen], target, self._boxes)
+        target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors)
+        at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
+        T_world_rig = se3(self._ego_log.xyz[at], self._ego_log.quat[at])
+        return carry([self._picture(i) for i in chosen], target, T_world_rig, self._boxes)
 
     def _picture(self, i: int) -> Picture:
         if i not in self._pictures:

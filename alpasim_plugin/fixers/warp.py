@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
+from alpasim_plugin.core.types import F32, F64, I64, U8, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
@@ -32,14 +33,12 @@ class WarpTarget:
         T_world_camera: ``(4, 4)``.
         depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as infinitely far.
         actors: ``T_world_box`` of the actors present.
-        T_rig_camera: ``(4, 4)``; the plane z = 0 of the rig is the ground below it. None: not known.
     """
 
     K: F64
     T_world_camera: F64
     depth: F32
     actors: Mapping[str, F64]
-    T_rig_camera: F64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,34 @@ class Picture:
     actors: Mapping[str, F64]
 
 
-def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_share: float | None = None) -> U8:
+class Lookup(NamedTuple):
+    """What says where the pixels of a view lie in a recorded frame.
+
+    Attributes:
+        depth: ``(H, W)`` of the view, metres; 0 is infinitely far.
+        K, T_world_camera: Of the view.
+        K_then, T_then_world: Of the recorded camera; the second maps the world to it.
+        depth_then: ``(H', W')`` of the recorded frame.
+        T_box_world: ``(A, 4, 4)`` the world to each actor's box, at the view's time.
+        T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the actor was absent.
+        sizes: ``(A, 3)`` length, width and height, metres.
+        free_share: A recorded surface that is at least this share of a point's distance away does not hide the point. Infinite: only one
+            that agrees with the point does not.
+    """
+
+    depth: F32
+    K: F64
+    T_world_camera: F64
+    K_then: F64
+    T_then_world: F64
+    depth_then: F32
+    T_box_world: F64
+    T_then_box: F64
+    sizes: F64
+    free_share: float
+
+
+def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_share: float = np.inf) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
     A pixel's surface point is moved with the box it lies in, from where the actor is now to where it was when the frame was recorded, and
@@ -63,8 +89,7 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
         picture: The recorded frame.
         target: The view.
         boxes: Sizes of the actors.
-        free_share: None, or the view's depth is that of the ground, which the recorded frame shows wherever its own depth is at least this
-            share of the point's.
+        free_share: See `Lookup`.
 
     Returns:
         ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with the point, `INCONSISTENT` where it does
@@ -75,9 +100,10 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([picture.actors.get(name, absent) for name in now]).reshape(-1, 4, 4)
     T_then_world = inverse(picture.T_world_camera)
-    x, y, held = warp_coordinates(
+    lookup = Lookup(
         target.depth, target.K, target.T_world_camera, picture.K, T_then_world, picture.depth, T_box_world, T_then_box, sizes, free_share
     )
+    x, y, held = warp_coordinates(lookup)
     out = np.empty((*held.shape, 4), np.uint8)
     out[..., :3] = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     out[..., 3] = held
@@ -91,33 +117,13 @@ def placed_boxes(actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> tuple[l
     return now, T_box_world, np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
 
 
-def warp_coordinates(
-    depth: F32,
-    K: F64,
-    T_world_camera: F64,
-    K_then: F64,
-    T_then_world: F64,
-    depth_then: F32,
-    T_box_world: F64,
-    T_then_box: F64,
-    sizes: F64,
-    free_share: float | None = None,
-) -> tuple[F32, F32, U8]:
+def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     """Return where every pixel of a view is to be looked up in a recorded frame, and how well that holds.
-
-    Args:
-        depth: ``(H, W)`` of the view, metres; 0 is infinitely far.
-        K, T_world_camera: Of the view.
-        K_then, T_then_world: Of the recorded camera; the second maps the world to it.
-        depth_then: ``(H', W')`` of the recorded frame.
-        T_box_world: ``(A, 4, 4)`` the world to each actor's box, at the view's time.
-        T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the actor was absent.
-        sizes: ``(A, 3)`` length, width and height, metres.
-        free_share: See `warp`.
 
     Returns:
         Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`, `INCONSISTENT` or 0 ``(H, W)``.
     """
+    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share = lookup
     height, width = depth.shape
     x, y, held = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is linear along a row.
@@ -127,8 +133,7 @@ def warp_coordinates(
     arrays = (
         np.ascontiguousarray(part, dtype=np.float64) for part in (A, b, ray, T_world_camera[:3, 3], project, T_box_world, T_then_box, sizes)
     )
-    share = np.inf if free_share is None else free_share
-    _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, share, x, y, held)
+    _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, free_share, x, y, held)
     return x, y, held
 
 
@@ -192,33 +197,16 @@ def box_around(px, py, pz, T_box, sizes):
     return -1
 
 
-def plain_coordinates(
-    depth: F32,
-    K: F64,
-    T_world_camera: F64,
-    K_then: F64,
-    T_then_world: F64,
-    depth_then: F32,
-    T_box_world: F64,
-    T_then_box: F64,
-    sizes: F64,
-    free_share: float | None = None,
-) -> tuple[F32, F32, U8]:
+def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
+    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share = lookup
     height, width = depth.shape
-    z = np.where(depth > 0, depth, INFINITY_M).astype(np.float64)
-    v, u = np.mgrid[:height, :width] + 0.5
-    points = _moved(T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1))
-    free: Bool = np.ones((height, width), dtype=bool)  # pixels that belong to no actor so far
-    there: Bool = np.ones((height, width), dtype=bool)  # pixels that are not of an actor that was absent
-    out = points.copy()
-    for T_box, T_then, size in zip(T_box_world, T_then_box, sizes, strict=True):
-        q = _moved(T_box, points)
-        inside = free & (np.abs(q[..., :2]) < size[:2] / 2 + np.array(AROUND_M[:2])).all(-1)
-        inside &= (q[..., 2] >= -size[2] / 2 + SOLE_M) & (q[..., 2] < size[2] / 2 + AROUND_M[2])
-        out[inside] = _moved(T_then, q[inside])
-        there[inside] = bool(np.isfinite(T_then).all())
-        free &= ~inside
+    points = plain_points(np.where(depth > 0, depth, INFINITY_M), K, T_world_camera)
+    inside = plain_box_around(points, T_box_world, sizes)
+    out, there = points.copy(), np.ones((height, width), dtype=bool)
+    for a, (T_box, T_then) in enumerate(zip(T_box_world, T_then_box, strict=True)):
+        out[inside == a] = _moved(T_then @ T_box, points[inside == a])
+        there[inside == a] = bool(np.isfinite(T_then).all())
     local = _moved(T_then_world, out)
     rz = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -229,11 +217,28 @@ def plain_coordinates(
     at = depth_then[np.where(seen, y, 0).astype(int), np.where(seen, x, 0).astype(int)]
     then = np.where(at > 0, at, INFINITY_M)
     far = (then > INFINITY_M / 2) & (rz > INFINITY_M / 2)
-    agrees = far | (np.abs(then - rz) < SLACK * rz + SLACK_M)
-    if free_share is not None:
-        agrees |= then >= free_share * rz
+    agrees = far | (then >= free_share * rz) | (np.abs(then - rz) < SLACK * rz + SLACK_M)
     held = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0).astype(np.uint8)
     return np.where(seen, x - 0.5, 0).astype(np.float32), np.where(seen, y - 0.5, 0).astype(np.float32), held
+
+
+def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
+    """Return the points of the world ``(H, W, 3)`` that pixels show at a depth ``(H, W)``."""
+    height, width = depth.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    z = depth.astype(np.float64)
+    return _moved(T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1))
+
+
+def plain_box_around(points: F64, T_box_world: F64, sizes: F64) -> I64:
+    """Return the same as `box_around` of points ``(H, W, 3)``, array by array: the reference of its kernel."""
+    found = np.full(points.shape[:-1], -1, dtype=np.int64)
+    for a, (T_box, size) in enumerate(zip(T_box_world, sizes, strict=True)):
+        q = _moved(T_box, points)
+        inside = (np.abs(q[..., :2]) < size[:2] / 2 + np.array(AROUND_M[:2])).all(-1)
+        inside &= (q[..., 2] >= -size[2] / 2 + SOLE_M) & (q[..., 2] < size[2] / 2 + AROUND_M[2])
+        found[inside & (found < 0)] = a
+    return found
 
 
 def _moved(T: F64, points: F64) -> F64:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -96,20 +97,16 @@ def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
     assert np.linalg.norm(placed.mounts["right"][:3, 3] - placed.mounts["left"][:3, 3]) == pytest.approx(0.54, abs=0.01)
 
 
-def test_the_facts_of_a_real_street(shared_data: Path) -> None:
-    folder = shared_data / "kitti-street"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+def test_the_facts_of_a_real_street(data_set: Callable[[str], Path]) -> None:
+    folder = data_set("kitti-street")
     drive = checked(read_source(folder, folder / "nowhere", told), folder)
     assert (len(drive.of("left")), len(drive.of("right"))) == (51, 51)
     across = np.linalg.inv(drive.of("left")[9].T_world_camera) @ drive.of("right")[9].T_world_camera
     assert across[:3, 3] == pytest.approx([0.5372, 0.0, 0.0], abs=1e-4)
 
 
-def test_the_facts_of_a_real_rig(shared_data: Path) -> None:
-    folder = shared_data / "dgp"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+def test_the_facts_of_a_real_rig(data_set: Callable[[str], Path]) -> None:
+    folder = data_set("dgp")
     drive = checked(read_source(folder, folder / "nowhere", told), folder)
     assert (drive.front, len(drive.cameras), len(drive.pictures), len(drive.tracks)) == ("CAMERA_01", 6, 18, 9)
     assert drive.points is not None
@@ -132,13 +129,11 @@ def test_times_put_photographs_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_rig_becomes_a_scenario_with_its_tracks(shared_data: Path, tmp_path: Path, quick_fit: None) -> None:
+def test_a_real_rig_becomes_a_scenario_with_its_tracks(data_set: Callable[[str], Path], tmp_path: Path, quick_fit: None) -> None:
     from alpasim_plugin.drives.build import import_drive
     from scenarios.load import load_scenario
 
-    if not (shared_data / "dgp").is_dir():
-        pytest.skip("the DGP scene is absent from the shared data")
-    import_drive(shared_data / "dgp", tmp_path / "out")
+    import_drive(data_set("dgp"), tmp_path / "out")
     scenario = load_scenario(tmp_path / "out/scenario.yaml")
     tracked = [actor for actor in scenario.actors if not actor.actor_id.startswith("obstacle-")]
     assert len(tracked) == 9

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.ground import carry, ground_hypothesis, plain_ground_hypothesis
 from alpasim_plugin.fixers.warp import VALID, Picture, WarpTarget, warp
@@ -16,6 +16,10 @@ WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
 K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]])
 NOBODY: Mapping[str, F64] = {}
+
+
+def rig(x_m: float) -> F64:
+    return se2(x_m, 0.0, 0.0)
 
 
 def rays(T_world_camera: F64) -> F64:
@@ -53,9 +57,9 @@ def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
     T, depth, truth = street(10.0)
     road = (slice(22, 40), slice(8, 56))
     depth[road] = fog_m
-    view = WarpTarget(K, T, depth, NOBODY, FORWARD)
+    view = WarpTarget(K, T, depth, NOBODY)
     pictures = [recorded(9.0), recorded(8.0)]
-    for image in carry(pictures, view, {}):
+    for image in carry(pictures, view, rig(10.0), {}):
         assert off(image, truth, road) < 6
         assert (image[road][..., 3] == VALID).mean() > 0.9
     assert off(warp(pictures[0], view, {}), truth, road) > 20
@@ -64,10 +68,9 @@ def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
 def test_a_wall_beyond_which_the_plane_goes_on_keeps_its_own_depth() -> None:
     T, depth, truth = street(10.0, wall_m=20.0)
     wall = (slice(18, 23), slice(8, 56))  # the ground of these pixels lies up to four times as far
-    assert (ground_hypothesis(WarpTarget(K, T, depth, NOBODY, FORWARD), {})[20:23] > 11).any()
-    pictures = [recorded(7.0, 20.0), recorded(5.0, 20.0)]
-    out = carry(pictures, WarpTarget(K, T, depth, NOBODY, FORWARD), {})
-    by_depth = [warp(picture, WarpTarget(K, T, depth, NOBODY), {}) for picture in pictures]
+    view, pictures = WarpTarget(K, T, depth, NOBODY), [recorded(7.0, 20.0), recorded(5.0, 20.0)]
+    assert (ground_hypothesis(view, rig(10.0), {})[20:23] > 11).any()
+    out, by_depth = carry(pictures, view, rig(10.0), {}), [warp(picture, view, {}) for picture in pictures]
     for image, own in zip(out, by_depth, strict=True):
         assert off(image, truth, wall) < off(own, truth, wall) + 3
 
@@ -77,8 +80,8 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
     car, box = se2(8.0, 0.0, 0.0, 0.75), {"car": Box(4.0, 2.0, 1.5)}
     rear = (slice(18, 24), slice(30, 34))
     depth[rear] = 6.0
-    free = ground_hypothesis(WarpTarget(K, T, depth, NOBODY, FORWARD), box)
-    held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}, FORWARD), box)
+    free = ground_hypothesis(WarpTarget(K, T, depth, NOBODY), rig(0.0), box)
+    held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}), rig(0.0), box)
     assert (free[22:24, 30:34] > 0).all()
     assert (held[rear] == 0).all()
     aside = np.ones(depth.shape, bool)
@@ -86,13 +89,14 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
     np.testing.assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
 
 
-def test_without_the_rig_the_depth_of_the_render_alone_counts() -> None:
-    T, depth, _ = street(10.0)
-    depth[22:40] = 0
-    view, pictures = WarpTarget(K, T, depth, NOBODY), [recorded(9.0), recorded(8.0)]
-    for image, picture in zip(carry(pictures, view, {}), pictures, strict=True):
+def test_a_camera_that_looks_up_sees_no_ground_and_no_picture_gives_none() -> None:
+    up = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, HEIGHT_M], [0, 0, 0, 1]])
+    view = WarpTarget(K, up, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY)
+    assert not ground_hypothesis(view, rig(0.0), {}).any()
+    pictures = [recorded(9.0), recorded(8.0)]
+    for image, picture in zip(carry(pictures, view, rig(0.0), {}), pictures, strict=True):
         np.testing.assert_array_equal(image, warp(picture, view, {}))
-    assert carry([], view, {}) == ()
+    assert carry([], WarpTarget(K, *street(10.0)[:2], NOBODY), rig(10.0), {}) == ()
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -104,8 +108,9 @@ def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
     T_rig_camera[2, 3] = rng.choice([-1.0, 0.0, 1e-9, 1.5, 400.0])  # below the ground, on it, and of a helicopter
     actors = {f"{i}": se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(0, 4)))}
     boxes = {name: Box(*rng.uniform(0.3, 6.0, 3)) for name in actors}
-    view = WarpTarget(K, se2(0.0, 0.0, 0.0) @ FORWARD, depth, actors, T_rig_camera)
-    fast, plain = ground_hypothesis(view, boxes), plain_ground_hypothesis(view, boxes)
+    view = WarpTarget(K, se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD, depth, actors)
+    T_world_rig = view.T_world_camera @ inverse(T_rig_camera)
+    fast, plain = ground_hypothesis(view, T_world_rig, boxes), plain_ground_hypothesis(view, T_world_rig, boxes)
     assert ((fast > 0) != (plain > 0)).mean() <= 1e-3  # a point exactly on a border may fall to either side
     both = (fast > 0) & (plain > 0)
     np.testing.assert_allclose(fast[both], plain[both], rtol=1e-5)

@@ -245,6 +245,8 @@ def test_the_facts_of_a_frame_do_not_depend_on_the_number_of_threads() -> None:
         found.append(trust(state))
     torch.set_num_threads(before)
     assert found[0] == found[1] == found[2]
+    half = trust(PixelState(*(part.bfloat16() for part in state)))
+    assert half == pytest.approx(found[0], abs=0.01)
 
 
 def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading: Path) -> None:

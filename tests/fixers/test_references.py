@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.types import F32, F64, U8, Actor, Box, CameraSpec, Frame, RecordedFrame, RenderRequest, Trajectory
 from alpasim_plugin.fixers.references import ReferenceIndex, ReferenceSession
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, plain_coordinates, warp, warp_coordinates
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Lookup, Picture, WarpTarget, plain_coordinates, warp, warp_coordinates
 
 WIDTH, HEIGHT = 64, 32
 K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
@@ -92,7 +93,7 @@ def test_a_car_is_looked_up_where_it_was() -> None:
     assert (gone[rows, car, 3] == 0).all()
 
 
-def hard_case(seed: int) -> tuple[F32, F64, F64, F64, F64, F32, F64, F64, F64]:
+def hard_case(seed: int) -> Lookup:
     """Depths of zero, of centimetres and of kilometres, cameras that look away, boxes around the camera, actors that were absent."""
     rng = np.random.default_rng(seed)
     depth, then = (np.exp(rng.uniform(-4, 9, (HEIGHT, WIDTH))).astype(np.float32) for _ in range(2))
@@ -103,13 +104,14 @@ def hard_case(seed: int) -> tuple[F32, F64, F64, F64, F64, F32, F64, F64, F64]:
     T_then = np.array([se2(*rng.uniform(-20, 20, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]).reshape(-1, 4, 4)
     T_then[rng.random(count) < 0.3] = np.nan
     sizes = rng.uniform(0.3, 6.0, (count, 3))
-    return depth, K, view, K, inverse(other), then, inverse(T_now) if count else T_now, T_then, sizes
+    free_share = float(rng.choice([0.0, 0.4, np.inf]))
+    return Lookup(depth, K, view, K, inverse(other), then, inverse(T_now) if count else T_now, T_then, sizes, free_share)
 
 
 @pytest.mark.parametrize("seed", range(24))
 def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
     case = hard_case(seed)
-    fast, plain = warp_coordinates(*case), plain_coordinates(*case)
+    fast, plain = warp_coordinates(case), plain_coordinates(case)
     # A point exactly on a border may fall to either side: at most one pixel in a thousand.
     differs = fast[2] != plain[2]
     assert differs.mean() <= 1e-3
@@ -148,16 +150,17 @@ def test_only_earlier_frames_are_references_where_the_past_is_asked_for() -> Non
     assert index.choose(at(6.0), 0, 3, past=True) == ()
 
 
-def session(which: str = "all", hysteresis: bool = True) -> tuple[ReferenceSession, list[int]]:
+def session(which: str = "all", hysteresis: bool = True, road_m: float = 0.0) -> tuple[ReferenceSession, list[int]]:
     reads: list[int] = []
 
     def read() -> tuple[U8, F32]:
         reads.append(1)
-        return np.full((HEIGHT, WIDTH, 3), 7, np.uint8), np.full((HEIGHT, WIDTH), 20.0, np.float32)
+        return np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), np.full((HEIGHT, WIDTH), 20.0, np.float32)
 
     car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
     frames = recorded([(float(x), 0.0) for x in range(0, 60, 2)], step_us=100_000, read=read)
-    return ReferenceSession(frames, [car], 2, which, hysteresis), reads  # type: ignore[arg-type]
+    ego_log = Trajectory(np.array([0, 6_000_000]), np.array([[0.0, 0, road_m], [60, 0, road_m]]), np.array([[1.0, 0, 0, 0]] * 2))
+    return ReferenceSession(frames, [car], ego_log, 2, which, hysteresis), reads  # type: ignore[arg-type]
 
 
 def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
@@ -172,6 +175,16 @@ def test_a_recorded_frame_is_read_when_it_is_first_needed_and_then_kept() -> Non
         references = found.of(*request(10.0 + 0.02 * step, 500_000 + step))
         assert [image.shape for image in references] == [(HEIGHT, WIDTH, 4)] * 2
     assert len(reads) == 2
+
+
+def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted() -> None:
+    asked, frame = request(10.0, 500_000)
+    frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), np.float32))  # nothing but holes
+    wrong = replace(asked, camera=replace(asked.camera, T_rig_camera=se2(0.0, 0.0, 0.0, 1.0) @ FORWARD))
+    images = session()[0].of(asked, frame)
+    for image, same, of_lower_road in zip(images, session()[0].of(wrong, frame), session(road_m=-1.0)[0].of(asked, frame), strict=True):
+        np.testing.assert_array_equal(image, same)
+        assert (image != of_lower_road).any()
 
 
 def test_a_frame_without_depth_has_no_references() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -79,10 +80,8 @@ def test_a_model_comes_back(tmp_path: Path, zipped: bool) -> None:
     assert np.allclose(cloud.sh, true["sh"], atol=1e-5)
 
 
-def test_three_levels_of_a_real_model_agree(shared_data: Path) -> None:
-    folder = shared_data / "gaussians/playbot"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+def test_three_levels_of_a_real_model_agree(data_set: Callable[[str], Path]) -> None:
+    folder = data_set("gaussians/playbot")
     clouds = [read_gaussians(folder / level)[0] for level in ("4_0", "5_0", "6_0")]
     assert [len(cloud) for cloud in clouds] == [8406, 3000, 1873]
     for cloud in clouds[1:]:

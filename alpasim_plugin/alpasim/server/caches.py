@@ -206,7 +206,8 @@ class SceneCache:
             recorded = renderer.recorded() if isinstance(settings, FixerSettings) and settings.references else ()
             if recorded:
                 assert isinstance(settings, FixerSettings)
-                references = ReferenceSession(recorded, scenario.actors, settings.references, settings.recording, hysteresis=False)
+                how_many, which = settings.references, settings.recording
+                references = ReferenceSession(recorded, scenario.actors, scenario.ego_log, how_many, which, hysteresis=False)
         return SceneEntry(scenario, prepare_map(scenario.lane_map) if self._needs_map else None, renderer, references)
 
     def _enter(self, source: str | Path) -> None:

@@ -84,7 +84,7 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
         used = chosen[draw.skipped :]
         places = [(j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j for slot, j in enumerate(used)]
         pictures = [_misplaced(_picture(sequence, at), error) for at, error in zip(places, draw.errors, strict=False)]
-        for slot, carried in enumerate(carry(pictures, target, boxes)):
+        for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)), boxes)):
             out[t, slot] = carried
     return out
 

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
 from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.references import ReferenceIndex
@@ -66,12 +67,16 @@ class SequenceReferences:
         for i in range(frames):
             last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
             target = self.target(i, self.K, whole, whole)
-            yield carry([self.picture(j) for j in last], target, sizes)
+            yield carry([self.picture(j) for j in last], target, self.T_world_rig(i), sizes)
 
     def target(self, i: int, K: F64, rows: slice, columns: slice) -> WarpTarget:
         """Return a crop of frame ``i`` as a view; ``K`` is that of the crop."""
-        depth = self.depth[i, rows, columns].astype(np.float32)
-        return WarpTarget(K, self.T_world_camera[i], depth, _named(self.actors[i]), self.T_rig_camera)
+        return WarpTarget(K, self.T_world_camera[i], self.depth[i, rows, columns].astype(np.float32), _named(self.actors[i]))
+
+    def T_world_rig(self, i: int) -> F64:
+        """Return the pose of the rig at frame ``i``."""
+        pose: F64 = self.T_world_camera[i] @ inverse(self.T_rig_camera)
+        return pose
 
     def picture(self, i: int) -> Picture:
         """Return recorded frame ``i``."""

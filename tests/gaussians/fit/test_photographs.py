@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.photographs import read_photographs, read_views
@@ -112,10 +112,8 @@ def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> Non
         triangulated(views, matches, [0], 1000, rng)
 
 
-def test_the_facts_of_a_real_set(shared_data: Path) -> None:
-    folder = shared_data / "fox"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+def test_the_facts_of_a_real_set(data_set: Callable[[str], Path]) -> None:
+    folder = data_set("fox")
     found = read_photographs(folder, 64)
     assert (len(found.views), found.listed, len(found.missing)) == (50, 67, 17)
     assert found.missing[:4] == ("images/0005.jpg", "images/0016.jpg", "images/0017.jpg", "images/0024.jpg")
@@ -128,28 +126,3 @@ def test_the_facts_of_a_real_set(shared_data: Path) -> None:
     spread = [np.linalg.norm(x - x.mean(axis=0), axis=1) for x in (here, centres)]
     np.testing.assert_allclose(spread[1] / spread[0], 4.0 / spread[0].max())  # one scale for all
     assert np.linalg.norm(centres, axis=1).max() == pytest.approx(4.0)
-
-
-@pytest.mark.slow
-def test_real_photographs_become_pairs_once(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = [
-        "train",
-        "photographs",
-        str(shared_data / "fox"),
-        "--out",
-        str(tmp_path),
-        "--width",
-        "64",
-        "--every",
-        "2",
-        "--steps",
-        "60",
-        "--json",
-    ]
-    assert run_command(command) == 0
-    rows = json.loads(capsys.readouterr().out)
-    assert (rows["sequences"], len(rows["missing"])) == (2, 17)
-    for row in rows["rows"]:
-        assert row["psnr_db"]["held_out"] > 14.0
-    assert run_command(command) == 0
-    assert not any(row["made"] for row in json.loads(capsys.readouterr().out)["rows"])
