@@ -6,9 +6,6 @@ with which two recorded frames agree: plane-sweeping stereo (Collins, 1996, "A s
 hypotheses a pixel. Where they agree equally well, or where only one frame is there, the ground is preferred.
 """
 
-# Numba's decorators are untyped.
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +14,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, box_around, placed_boxes, plain_box_around, plain_points, warp
+from alpasim_plugin.core.types import F32, F64, U8, Box
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, in_boxes, warp
 
 I32 = npt.NDArray[np.int32]
 
@@ -29,6 +25,7 @@ FREE_SHARE = 0.4  # a surface nearer than this share of the ground's depth stand
 WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
 PREFERENCE = 3  # grey levels by which the ground may agree less than the render's depth does
 GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
+HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind shows nowhere
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
@@ -53,7 +50,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, box
     K = target.K.copy()
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
-    by_ground = [warp(picture, view, boxes, FREE_SHARE) for picture in pictures]
+    by_ground = [warp(_hidden_by_users(picture, boxes), view, boxes, FREE_SHARE) for picture in pictures]
     ground = view.depth > 0
     if len(pictures) > 1:
         size = max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
@@ -71,50 +68,21 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, 
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
     nearer than `FREE_SHARE` of that and does not lie in an actor's box. Arguments as of `carry`.
     """
-    _, T_box_world, sizes = placed_boxes(target.actors, boxes)
-    # A pixel p at depth z lies at z ray p + eye in the world, and so at the height z (down . p) + height_m above the ground.
-    ray, eye = (
-        np.ascontiguousarray(target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)),
-        np.ascontiguousarray(target.T_world_camera[:3, 3]),
-    )
-    up = T_world_rig[:3, 2]
-    out = np.zeros(target.depth.shape, np.float32)
-    _ground(np.ascontiguousarray(target.depth), up @ ray, float(up @ (eye - T_world_rig[:3, 3])), ray, eye, T_box_world, sizes, out)
-    return out
+    height, width = target.depth.shape
+    # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
+    down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
+    height_m = T_world_rig[:3, 2] @ (target.T_world_camera[:3, 3] - T_world_rig[:3, 3])
+    slope = down[0] * (np.arange(width) + 0.5) + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
+    z = np.divide(-height_m, slope, out=np.zeros_like(slope), where=slope < 0)
+    free = (target.depth <= 0) | (target.depth >= FREE_SHARE * z)
+    free &= (z > NEAREST_M) & (z < FARTHEST_M) & ~in_boxes(target.depth, target.K, target.T_world_camera, target.actors, boxes)
+    return np.where(free, z, 0).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ground(depth, down, height_m, ray, eye, T_box, sizes, out):
-    """Fill ``out``; the loop of `plain_ground_hypothesis`."""
-    for row in range(depth.shape[0]):
-        v = row + 0.5
-        for column in range(depth.shape[1]):
-            u = column + 0.5
-            z = -height_m / (down[0] * u + down[1] * v + down[2])
-            if not NEAREST_M < z < FARTHEST_M:
-                continue
-            seen = np.float64(depth[row, column])
-            if seen > 0:
-                if seen < FREE_SHARE * z:
-                    continue
-                px = seen * (ray[0, 0] * u + ray[0, 1] * v + ray[0, 2]) + eye[0]
-                py = seen * (ray[1, 0] * u + ray[1, 1] * v + ray[1, 2]) + eye[1]
-                pz = seen * (ray[2, 0] * u + ray[2, 1] * v + ray[2, 2]) + eye[2]
-                if box_around(px, py, pz, T_box, sizes) >= 0:
-                    continue
-            out[row, column] = z
-
-
-def plain_ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> F32:
-    """Return the same as `ground_hypothesis`, array by array: the reference of its kernel."""
-    one_m = plain_points(np.ones_like(target.depth), target.K, target.T_world_camera)
-    up, eye = T_world_rig[:3, 2], target.T_world_camera[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = up @ (T_world_rig[:3, 3] - eye) / ((one_m - eye) @ up)
-    _, T_box_world, sizes = placed_boxes(target.actors, boxes)
-    boxed = plain_box_around(plain_points(target.depth, target.K, target.T_world_camera), T_box_world, sizes) >= 0
-    may: Bool = (z > NEAREST_M) & (z < FARTHEST_M) & ((target.depth <= 0) | ((target.depth >= FREE_SHARE * z) & ~boxed))
-    return np.where(may, z, 0).astype(np.float32)
+def _hidden_by_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
+    """Return a recorded frame whose road users hide all ground behind them, however near to it they stand."""
+    users = in_boxes(picture.depth, picture.K, picture.T_world_camera, picture.actors, boxes)
+    return replace(picture, depth=np.where(users, np.float32(HIDING_M), picture.depth)) if users.any() else picture
 
 
 def _disagreement(a: U8, b: U8, size: int) -> I32:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, I64, U8, Box
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
@@ -155,7 +155,7 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
                 px = z * (ray[0, 0] * u0 + ray[0, 1] * v0 + ray[0, 2]) + eye[0]
                 py = z * (ray[1, 0] * u0 + ray[1, 1] * v0 + ray[1, 2]) + eye[1]
                 pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
-                a = box_around(px, py, pz, T_box, sizes)
+                a = _box_around(px, py, pz, T_box, sizes)
                 if a >= 0:
                     W, B = T_then_box[a], T_box[a]
                     if not np.isfinite(W[0, 0]):
@@ -183,7 +183,7 @@ def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def box_around(px, py, pz, T_box, sizes):
+def _box_around(px, py, pz, T_box, sizes):
     """Return the first box that a point of the world lies in; -1: none."""
     for a in range(sizes.shape[0]):
         B = T_box[a]
@@ -195,6 +195,37 @@ def box_around(px, py, pz, T_box, sizes):
         if abs(qx) < sizes[a, 0] / 2 + AROUND_M[0] and abs(qy) < sizes[a, 1] / 2 + AROUND_M[1]:
             return a
     return -1
+
+
+def in_boxes(depth: F32, K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
+    """Return the pixels whose surface lies in an actor's box ``(H, W)``.
+
+    Args:
+        depth: ``(H, W)`` metres; 0 where no surface is.
+        K, T_world_camera: Of the camera.
+        actors: ``T_world_box`` of the actors present.
+        boxes: Their sizes.
+    """
+    _, T_box_world, sizes = placed_boxes(actors, boxes)
+    out: Bool = np.zeros(depth.shape, dtype=bool)
+    ray, eye = np.ascontiguousarray(T_world_camera[:3, :3] @ np.linalg.inv(K)), np.ascontiguousarray(T_world_camera[:3, 3])
+    if len(sizes):
+        _in_boxes(np.ascontiguousarray(depth), ray, eye, T_box_world, sizes, out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _in_boxes(depth, ray, eye, T_box, sizes, out):
+    """Fill ``out``."""
+    for row in range(depth.shape[0]):
+        v = row + 0.5
+        for column in range(depth.shape[1]):
+            u, z = column + 0.5, np.float64(depth[row, column])
+            if z > 0:
+                px = z * (ray[0, 0] * u + ray[0, 1] * v + ray[0, 2]) + eye[0]
+                py = z * (ray[1, 0] * u + ray[1, 1] * v + ray[1, 2]) + eye[1]
+                pz = z * (ray[2, 0] * u + ray[2, 1] * v + ray[2, 2]) + eye[2]
+                out[row, column] = _box_around(px, py, pz, T_box, sizes) >= 0
 
 
 def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
@@ -231,7 +262,7 @@ def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
 
 
 def plain_box_around(points: F64, T_box_world: F64, sizes: F64) -> I64:
-    """Return the same as `box_around` of points ``(H, W, 3)``, array by array: the reference of its kernel."""
+    """Return the same as `_box_around` of points ``(H, W, 3)``, array by array: the reference of its kernel."""
     found = np.full(points.shape[:-1], -1, dtype=np.int64)
     for a, (T_box, size) in enumerate(zip(T_box_world, sizes, strict=True)):
         q = _moved(T_box, points)

@@ -7,10 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.geometry import inverse, se2
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.ground import carry, ground_hypothesis, plain_ground_hypothesis
-from alpasim_plugin.fixers.warp import VALID, Picture, WarpTarget, warp
+from alpasim_plugin.fixers.ground import carry, ground_hypothesis
+from alpasim_plugin.fixers.warp import (
+    INCONSISTENT,
+    VALID,
+    Picture,
+    WarpTarget,
+    in_boxes,
+    placed_boxes,
+    plain_box_around,
+    plain_points,
+    warp,
+)
 
 WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
 K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
@@ -99,18 +109,39 @@ def test_a_camera_that_looks_up_sees_no_ground_and_no_picture_gives_none() -> No
     assert carry([], WarpTarget(K, *street(10.0)[:2], NOBODY), rig(10.0), {}) == ()
 
 
+def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
+    box, then = {"car": Box(4.0, 2.0, 1.5)}, se2(17.0, 0.0, 0.0, 0.75)
+    T, depth, rgb = street(9.0)
+    rear = (slice(18, 26), slice(25, 39))
+    rgb[rear], depth[rear] = 0, 6.1  # it hid the ground from 6 m on, and has left since
+    recorded_car = Picture(K, T, rgb, depth, {"car": then})
+    here, own, _ = street(9.0)
+    image, _ = carry([recorded_car, recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY), rig(9.0), box)
+    hidden = (slice(19, 25), slice(26, 38))
+    assert (image[hidden][..., 3] == INCONSISTENT).all()
+    assert (image[19:25, :20, 3] == VALID).all()
+
+
 @pytest.mark.parametrize("seed", range(12))
-def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
+def test_what_lies_in_a_box_is_what_plain_arithmetic_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    depth = np.exp(rng.uniform(-4, 9, (HEIGHT, WIDTH))).astype(np.float32)
+    depth = np.exp(rng.uniform(-4, 4, (HEIGHT, WIDTH))).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0
-    T_rig_camera = se2(*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)) @ FORWARD
-    T_rig_camera[2, 3] = rng.choice([-1.0, 0.0, 1e-9, 1.5, 400.0])  # below the ground, on it, and of a helicopter
     actors = {f"{i}": se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(0, 4)))}
     boxes = {name: Box(*rng.uniform(0.3, 6.0, 3)) for name in actors}
-    view = WarpTarget(K, se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD, depth, actors)
-    T_world_rig = view.T_world_camera @ inverse(T_rig_camera)
-    fast, plain = ground_hypothesis(view, T_world_rig, boxes), plain_ground_hypothesis(view, T_world_rig, boxes)
-    assert ((fast > 0) != (plain > 0)).mean() <= 1e-3  # a point exactly on a border may fall to either side
-    both = (fast > 0) & (plain > 0)
-    np.testing.assert_allclose(fast[both], plain[both], rtol=1e-5)
+    T = se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD
+    _, T_box_world, sizes = placed_boxes(actors, boxes)
+    plain = (plain_box_around(plain_points(depth, K, T), T_box_world, sizes) >= 0) & (depth > 0)
+    assert (in_boxes(depth, K, T, actors, boxes) != plain).mean() <= 1e-3  # a point exactly on a border may fall to either side
+
+
+@pytest.mark.parametrize("height_m", [-1.0, 0.0, 1e-9, 1.5, 400.0])  # below the ground, on it, and of a helicopter
+def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m: float) -> None:
+    T_world_rig = se2(3.0, -2.0, 0.7) @ np.array([[1.0, 0, 0, 0], [0, 0.99, -0.14, 0], [0, 0.14, 0.99, 0], [0, 0, 0, 1]])  # rolled
+    T_rig_camera = FORWARD.copy()
+    T_rig_camera[2, 3] = height_m
+    view = WarpTarget(K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY)
+    depth = ground_hypothesis(view, T_world_rig, {})
+    assert (depth > 0).any() == (height_m == 1.5)  # from too far above the road is no plane
+    below = plain_points(depth, K, view.T_world_camera)[depth > 0] - T_world_rig[:3, 3]
+    assert np.abs(below @ T_world_rig[:3, 2]).max(initial=0) < 1e-4
