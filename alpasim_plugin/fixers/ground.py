@@ -33,7 +33,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, box
     """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of every pixel.
 
     Args:
-        pictures: Recorded frames, nearest first; the first two are compared.
+        pictures: Recorded frames as of `with_users`, nearest first; the first two are compared.
         target: The view.
         T_world_rig: ``(4, 4)`` of a rig near the view; the plane z = 0 of it is the ground.
         boxes: Sizes of the actors; what lies in the box of one keeps the render's depth.
@@ -50,7 +50,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, box
     K = target.K.copy()
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
-    by_ground = [warp(_hidden_by_users(picture, boxes), view, boxes, FREE_SHARE) for picture in pictures]
+    by_ground = [warp(_hidden_by_users(picture), view, boxes, FREE_SHARE) for picture in pictures]
     ground = view.depth > 0
     if len(pictures) > 1:
         size = max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
@@ -79,10 +79,15 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, 
     return np.where(free, z, 0).astype(np.float32)
 
 
-def _hidden_by_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
-    """Return a recorded frame whose road users hide all ground behind them, however near to it they stand."""
+def with_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
+    """Return a recorded frame that knows which of its pixels show road users."""
     users = in_boxes(picture.depth, picture.K, picture.T_world_camera, picture.actors, boxes)
-    return replace(picture, depth=np.where(users, np.float32(HIDING_M), picture.depth)) if users.any() else picture
+    return replace(picture, users=users) if users.any() else picture
+
+
+def _hidden_by_users(picture: Picture) -> Picture:
+    """Return a recorded frame whose road users hide all ground behind them, however near to it they stand."""
+    return picture if picture.users is None else replace(picture, depth=np.where(picture.users, np.float32(HIDING_M), picture.depth))
 
 
 def _disagreement(a: U8, b: U8, size: int) -> I32:

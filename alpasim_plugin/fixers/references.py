@@ -18,7 +18,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest, Trajectory
-from alpasim_plugin.fixers.ground import carry
+from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import Picture, WarpTarget
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
@@ -116,7 +116,8 @@ class ReferenceSession:
     def _picture(self, i: int) -> Picture:
         if i not in self._pictures:
             frame = self.index.recorded[i]
-            self._pictures[i] = Picture(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
+            picture = Picture(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
+            self._pictures[i] = with_users(picture, self._boxes)
             if len(self._pictures) > KEPT_FRAMES:
                 self._pictures.popitem(last=False)
         self._pictures.move_to_end(i)

@@ -43,13 +43,14 @@ class WarpTarget:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A recorded frame in memory: see `RecordedFrame`."""
+    """A recorded frame in memory: see `RecordedFrame`; ``users`` are the pixels of its road users ``(H, W)``, None where there are none."""
 
     K: F64
     T_world_camera: F64
     rgb: U8
     depth: F32
     actors: Mapping[str, F64]
+    users: Bool | None = None
 
 
 class Lookup(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.ground import carry, ground_hypothesis
+from alpasim_plugin.fixers.ground import carry, ground_hypothesis, with_users
 from alpasim_plugin.fixers.warp import (
     INCONSISTENT,
     VALID,
@@ -116,7 +116,7 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
     rgb[rear], depth[rear] = 0, 6.1  # it hid the ground from 6 m on, and has left since
     recorded_car = Picture(K, T, rgb, depth, {"car": then})
     here, own, _ = street(9.0)
-    image, _ = carry([recorded_car, recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY), rig(9.0), box)
+    image, _ = carry([with_users(recorded_car, box), recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY), rig(9.0), box)
     hidden = (slice(19, 25), slice(26, 38))
     assert (image[hidden][..., 3] == INCONSISTENT).all()
     assert (image[19:25, :20, 3] == VALID).all()

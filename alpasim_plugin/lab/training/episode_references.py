@@ -7,7 +7,7 @@ for the recording, carried along by optical flow, which is then bent by a smooth
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -135,7 +135,7 @@ def _misplaced(picture: Picture, error: F64) -> Picture:
         return picture
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(error[3:])[0], error[:3]
-    return Picture(picture.K, picture.T_world_camera @ T, picture.rgb, picture.depth, picture.actors)
+    return replace(picture, T_world_camera=picture.T_world_camera @ T)
 
 
 @lru_cache(maxsize=OPEN_SEQUENCES)

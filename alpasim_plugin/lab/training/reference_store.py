@@ -21,7 +21,7 @@ import numpy.typing as npt
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
-from alpasim_plugin.fixers.ground import carry
+from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.references import ReferenceIndex
 from alpasim_plugin.fixers.warp import Picture, WarpTarget
 from alpasim_plugin.io.reading.arrays import open_npy
@@ -81,7 +81,8 @@ class SequenceReferences:
     def picture(self, i: int) -> Picture:
         """Return recorded frame ``i``."""
         depth = self.rgb_depth[i].astype(np.float32)
-        return Picture(self.K, self.rgb_T_world_camera[i], np.ascontiguousarray(self.rgb[i]), depth, _named(self.rgb_actors[i]))
+        picture = Picture(self.K, self.rgb_T_world_camera[i], np.ascontiguousarray(self.rgb[i]), depth, _named(self.rgb_actors[i]))
+        return with_users(picture, self.sizes())
 
     def sizes(self) -> dict[str, Box]:
         """Return the actors' boxes."""
