@@ -109,7 +109,7 @@ def find_cell(what: Path, doing: str) -> tuple[Path, Wanted | None]:
         root = next((folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None)
         if root is not None:
             return root, Wanted((str(manifest["scene"]),), (str(manifest["policy"]),), (int(manifest["seed"]),))
-    found = "no run.json and no manifest.json" if what.is_dir() else "no such folder"
+    found = "no run.json and no manifest.json" if what.exists() else "no such folder"
     raise InputError(doing, str(what), found, "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED")
 
 
