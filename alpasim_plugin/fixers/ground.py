@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, in_boxes, warp
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, warp
 
 I32 = npt.NDArray[np.int32]
 
@@ -36,7 +36,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, box
         pictures: Recorded frames as of `with_users`, nearest first; the first two are compared.
         target: The view.
         T_world_rig: ``(4, 4)`` of a rig near the view; the plane z = 0 of it is the ground.
-        boxes: Sizes of the actors; what lies in the box of one keeps the render's depth.
+        boxes: Sizes of the actors; where a ray meets the box of one, the render's depth counts.
 
     Returns:
         For each picture ``(H, W, 4)`` uint8: see `warp`.
@@ -66,7 +66,7 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, 
     """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of the view may show it; elsewhere 0.
 
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
-    nearer than `FREE_SHARE` of that and does not lie in an actor's box. Arguments as of `carry`.
+    nearer than `FREE_SHARE` of that, and the ray meets no actor's box. Arguments as of `carry`.
     """
     height, width = target.depth.shape
     # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
@@ -75,13 +75,14 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, 
     slope = down[0] * (np.arange(width) + 0.5) + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
     z = np.divide(-height_m, slope, out=np.zeros_like(slope), where=slope < 0)
     free = (target.depth <= 0) | (target.depth >= FREE_SHARE * z)
-    free &= (z > NEAREST_M) & (z < FARTHEST_M) & ~in_boxes(target.depth, target.K, target.T_world_camera, target.actors, boxes)
+    free &= (z > NEAREST_M) & (z < FARTHEST_M) & ~on_boxes((height, width), target.K, target.T_world_camera, target.actors, boxes)
     return np.where(free, z, 0).astype(np.float32)
 
 
 def with_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
     """Return a recorded frame that knows which of its pixels show road users."""
-    users = in_boxes(picture.depth, picture.K, picture.T_world_camera, picture.actors, boxes)
+    height, width = picture.depth.shape
+    users = on_boxes((height, width), picture.K, picture.T_world_camera, picture.actors, boxes)
     return replace(picture, users=users) if users.any() else picture
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
+from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
@@ -198,35 +198,70 @@ def _box_around(px, py, pz, T_box, sizes):
     return -1
 
 
-def in_boxes(depth: F32, K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
-    """Return the pixels whose surface lies in an actor's box ``(H, W)``.
+def on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
+    """Return the pixels of a camera ``shape`` whose ray meets an actor's box.
 
     Args:
-        depth: ``(H, W)`` metres; 0 where no surface is.
+        shape: Rows and columns.
         K, T_world_camera: Of the camera.
         actors: ``T_world_box`` of the actors present.
         boxes: Their sizes.
     """
     _, T_box_world, sizes = placed_boxes(actors, boxes)
-    out: Bool = np.zeros(depth.shape, dtype=bool)
-    ray, eye = np.ascontiguousarray(T_world_camera[:3, :3] @ np.linalg.inv(K)), np.ascontiguousarray(T_world_camera[:3, 3])
-    if len(sizes):
-        _in_boxes(np.ascontiguousarray(depth), ray, eye, T_box_world, sizes, out)
+    out: Bool = np.zeros(shape, dtype=bool)
+    for T_box_camera, size in zip(T_box_world @ T_world_camera, sizes, strict=True):
+        low, high = _walls(size)
+        corners = _moved(K @ inverse(T_box_camera)[:3], np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3))
+        if (corners[:, 2] <= 0).all():
+            continue
+        first, last = np.zeros(2, dtype=np.int64), np.array(shape[::-1])
+        if (corners[:, 2] > NEAREST_M).all():  # else some corners lie behind the camera, and the box may reach anywhere
+            u_v = corners[:, :2] / corners[:, 2:]
+            first, last = (np.clip(edge, 0, last).astype(np.int64) for edge in (np.floor(u_v.min(axis=0)), np.ceil(u_v.max(axis=0))))
+        part = out[first[1] : last[1], first[0] : last[0]]
+        ray = np.ascontiguousarray(T_box_camera[:3, :3] @ np.linalg.inv(K))
+        _add_box(ray, T_box_camera[:3, 3].copy(), low, high, first[0], first[1], part)
     return out
 
 
+def _walls(size: F64) -> tuple[F64, F64]:
+    """Return the least and the greatest coordinates of what moves with a box."""
+    around, up = size / 2 + np.array(AROUND_M), size[2] / 2
+    return np.array([-around[0], -around[1], SOLE_M - up]), around
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _in_boxes(depth, ray, eye, T_box, sizes, out):
-    """Fill ``out``."""
-    for row in range(depth.shape[0]):
-        v = row + 0.5
-        for column in range(depth.shape[1]):
-            u, z = column + 0.5, np.float64(depth[row, column])
-            if z > 0:
-                px = z * (ray[0, 0] * u + ray[0, 1] * v + ray[0, 2]) + eye[0]
-                py = z * (ray[1, 0] * u + ray[1, 1] * v + ray[1, 2]) + eye[1]
-                pz = z * (ray[2, 0] * u + ray[2, 1] * v + ray[2, 2]) + eye[2]
-                out[row, column] = _box_around(px, py, pz, T_box, sizes) >= 0
+def _add_box(ray, eye, low, high, left, top, out):
+    """Add the pixels that show one box to a part of a picture that begins at (left, top), by the slab method (Kay and Kajiya, 1986).
+
+    ``ray`` and ``eye`` are in the box's axes.
+    """
+    for row in range(out.shape[0]):
+        v = top + row + 0.5
+        for column in range(out.shape[1]):
+            u, near, far = left + column + 0.5, 0.0, np.inf
+            for axis in range(3):
+                along = ray[axis, 0] * u + ray[axis, 1] * v + ray[axis, 2]
+                if along == 0.0:
+                    if not low[axis] < eye[axis] < high[axis]:
+                        far = -1.0
+                    continue
+                a, b = (low[axis] - eye[axis]) / along, (high[axis] - eye[axis]) / along
+                near, far = max(near, min(a, b)), min(far, max(a, b))
+            if near < far:
+                out[row, column] = True
+
+
+def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
+    """Return the same as `on_boxes`, array by array: the reference of its kernel."""
+    rays = plain_points(np.ones(shape), K, T_world_camera) - T_world_camera[:3, 3]
+    out: Bool = np.zeros(shape, dtype=bool)
+    _, T_box_world, sizes = placed_boxes(actors, boxes)
+    for T_box, size in zip(T_box_world, sizes, strict=True):
+        with np.errstate(divide="ignore"):
+            hits = (np.stack(_walls(size)) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (rays @ T_box[:3, :3].T)
+        out |= np.maximum(hits.min(axis=0).max(axis=-1), 0) < hits.max(axis=0).min(axis=-1)
+    return out
 
 
 def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
@@ -234,11 +269,14 @@ def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share = lookup
     height, width = depth.shape
     points = plain_points(np.where(depth > 0, depth, INFINITY_M), K, T_world_camera)
-    inside = plain_box_around(points, T_box_world, sizes)
-    out, there = points.copy(), np.ones((height, width), dtype=bool)
-    for a, (T_box, T_then) in enumerate(zip(T_box_world, T_then_box, strict=True)):
-        out[inside == a] = _moved(T_then @ T_box, points[inside == a])
-        there[inside == a] = bool(np.isfinite(T_then).all())
+    out, there, free = points.copy(), np.ones((height, width), dtype=bool), np.ones((height, width), dtype=bool)
+    for T_box, T_then, size in zip(T_box_world, T_then_box, sizes, strict=True):
+        q = _moved(T_box, points)
+        low, high = _walls(size)
+        inside = free & (np.abs(q[..., :2]) < high[:2]).all(-1) & (q[..., 2] >= low[2]) & (q[..., 2] < high[2])
+        out[inside] = _moved(T_then, q[inside])
+        there[inside] = bool(np.isfinite(T_then).all())
+        free &= ~inside
     local = _moved(T_then_world, out)
     rz = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -260,17 +298,6 @@ def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
     v, u = np.mgrid[:height, :width] + 0.5
     z = depth.astype(np.float64)
     return _moved(T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1))
-
-
-def plain_box_around(points: F64, T_box_world: F64, sizes: F64) -> I64:
-    """Return the same as `_box_around` of points ``(H, W, 3)``, array by array: the reference of its kernel."""
-    found = np.full(points.shape[:-1], -1, dtype=np.int64)
-    for a, (T_box, size) in enumerate(zip(T_box_world, sizes, strict=True)):
-        q = _moved(T_box, points)
-        inside = (np.abs(q[..., :2]) < size[:2] / 2 + np.array(AROUND_M[:2])).all(-1)
-        inside &= (q[..., 2] >= -size[2] / 2 + SOLE_M) & (q[..., 2] < size[2] / 2 + AROUND_M[2])
-        found[inside & (found < 0)] = a
-    return found
 
 
 def _moved(T: F64, points: F64) -> F64:

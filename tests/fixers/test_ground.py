@@ -10,17 +10,7 @@ import pytest
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.ground import carry, ground_hypothesis, with_users
-from alpasim_plugin.fixers.warp import (
-    INCONSISTENT,
-    VALID,
-    Picture,
-    WarpTarget,
-    in_boxes,
-    placed_boxes,
-    plain_box_around,
-    plain_points,
-    warp,
-)
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, on_boxes, plain_on_boxes, plain_points, warp
 
 WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
 K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
@@ -113,7 +103,7 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
     box, then = {"car": Box(4.0, 2.0, 1.5)}, se2(17.0, 0.0, 0.0, 0.75)
     T, depth, rgb = street(9.0)
     rear = (slice(18, 26), slice(25, 39))
-    rgb[rear], depth[rear] = 0, 6.1  # it hid the ground from 6 m on, and has left since
+    rgb[rear] = 0  # it hid the road, of which its own reconstruction knows nothing, and has left since
     recorded_car = Picture(K, T, rgb, depth, {"car": then})
     here, own, _ = street(9.0)
     image, _ = carry([with_users(recorded_car, box), recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY), rig(9.0), box)
@@ -123,16 +113,13 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_what_lies_in_a_box_is_what_plain_arithmetic_says(seed: int) -> None:
+def test_where_a_box_is_seen_is_what_plain_arithmetic_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    depth = np.exp(rng.uniform(-4, 4, (HEIGHT, WIDTH))).astype(np.float32)
-    depth[rng.random(depth.shape) < 0.2] = 0
-    actors = {f"{i}": se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(0, 4)))}
+    actors = {f"{i}": se2(*rng.uniform(-12, 12, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(1, 6)))}
     boxes = {name: Box(*rng.uniform(0.3, 6.0, 3)) for name in actors}
-    T = se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD
-    _, T_box_world, sizes = placed_boxes(actors, boxes)
-    plain = (plain_box_around(plain_points(depth, K, T), T_box_world, sizes) >= 0) & (depth > 0)
-    assert (in_boxes(depth, K, T, actors, boxes) != plain).mean() <= 1e-3  # a point exactly on a border may fall to either side
+    T = se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD  # in some cases the camera stands in a box
+    found, plain = (of((HEIGHT, WIDTH), K, T, actors, boxes) for of in (on_boxes, plain_on_boxes))
+    assert (found != plain).mean() <= 1e-3  # a ray exactly along a wall may fall to either side
 
 
 @pytest.mark.parametrize("height_m", [-1.0, 0.0, 1e-9, 1.5, 400.0])  # below the ground, on it, and of a helicopter
