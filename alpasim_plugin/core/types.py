@@ -149,7 +149,7 @@ class Frame:
     alpha: F32 | None = None  # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
     depth: F32 | None = None  # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
-    facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
+    facts: Mapping[str, float | str] = field(default_factory=dict)  # about this frame, for the log, such as "pose_error_m"
     references: tuple[U8, ...] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
 
 

@@ -18,7 +18,7 @@ from evaluators import preset as find_preset
 from evaluators.metrics.route import lateral_bias
 
 # Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
-FIXER_FACTS = ("pose_error_m", "forecast_error_m")
+FIXER_FACTS = ("pose_error_m", "forecast_error_m", "recorded_share", "guessed_share")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from alpasim_plugin.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from alpasim_plugin.viewer.page import as_json, fill
 from alpasim_plugin.viewer.page_data import cell_data, lens_data, read_logs
 from alpasim_plugin.viewer.pictures import jpeg, smaller
+from alpasim_plugin.viewer.trust_data import frame_rows, seen_before
 from evaluators.metrics.outcomes import OUTCOMES, in_words, outcomes_of
 from evaluators.opening import Run
 
@@ -285,13 +286,18 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
         outcome=in_words(outcomes_of(rollout)),
         failed_us=failed_us,
         start_us=log.render_start_us,
-        sentences=[sentence(one, log.render_start_us) for one in partings],
+        sentences=[*(sentence(one, log.render_start_us) for one in partings), *_seen_before(run, rollout, failed_us)],
         looks=looks_of(log, rollout.renderer, failed_us),
         tried=[],
         depends=[],
         partings=partings,
         commands=commands(run, rollout, log.render_start_us, failed_us, partings),
     )
+
+
+def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[tuple[str, str]]:
+    text = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
+    return [("seen", f"{text}.")] if text else []
 
 
 def sentence(one: Parting, start_us: int) -> tuple[str, str]:

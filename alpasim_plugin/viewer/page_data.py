@@ -15,6 +15,7 @@ from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
+from alpasim_plugin.viewer.trust_data import cells_by_time, frame_rows
 from evaluators.opening import Run
 from evaluators.report.flips import FLIPS_NAME, baseline_of, key_of_entry
 from evaluators.report.rollouts import clock_zero_us
@@ -70,13 +71,17 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
         if isinstance(log, SimrunError):
             drives.append({"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.found}"})
             continue
-        drive = {"renderer": cell.side(rollout)} | drive_data(run, rollout, log, content, place, tracks)
+        facts = frame_rows(run, rollout)
+        drive = {"renderer": cell.side(rollout)} | drive_data(run, rollout, log, content, place, tracks, facts)
         drive |= {"why": run.href(rollout, WHY_NAME) or ""}
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
             drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
             known = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
             for one in drive["cameras"]:
+                cells = {place.ms([t_us])[0]: text for t_us, text in cells_by_time(facts, one["name"]).items()}
+                if cells:
+                    one["trust"] = [cells.get(t, "") for t in one["t"]]
                 if one["name"] in known:
                     one["lens"] = lens_data(known[one["name"]], one["width"])
             drive["no_frames"] = "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
