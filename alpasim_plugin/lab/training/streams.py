@@ -41,7 +41,7 @@ SIDE = 16  # crops are multiples of it
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
 P_BETTER, BETTER = 0.15, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
-P_DRIVE = 0.4  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
+P_DRIVE = 0.3  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
 P_GREY = 0.06  # recordings without colour
 # A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
 # render is the truth, moved by a smooth field; where it doubles, the mean of two.
