@@ -210,7 +210,7 @@ def _names(kind: str) -> Callable[[str], list[str]]:
     def offer(incomplete: str) -> list[str]:
         from alpasim_plugin.plugins.parts import names
         from evaluators import PRESETS
-        from scenarios.library import shipped_names, suites
+        from scenarios.suite import shipped_names, suites
 
         before, comma, last = incomplete.rpartition(",")
         known = {"preset": lambda: [*PRESETS], "scenario": lambda: [*shipped_names(), *suites()]}

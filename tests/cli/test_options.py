@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import pytest
 import typer
 
-from alpasim_plugin.cli import decide, gate, run, serve, serve_policy, view
+from alpasim_plugin.cli import decide, gate, run, serve, view
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, Only, command_of
 from alpasim_plugin.core.flags import Flag, Positional
@@ -95,7 +95,7 @@ def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path
 @pytest.mark.parametrize("words", [("serve", "--renderer", "identity", "--upstream", "host:1"), ("serve-policy", "lane-camera")])
 def test_callers_of_every_server_are_let_in_as_asked(called: Any, tmp_path: Path, words: tuple[str, ...]) -> None:
     files = ("--tls-cert", "cert.pem", "--tls-key", "key.pem", "--tls-client-ca", "callers.pem", "--token-file", str(tmp_path / "token"))
-    given = called(serve if words[0] == "serve" else serve_policy, "Host", *words, "--drain-s", "1", "--expiry-s", "9", *files)["policy"]
+    given = called(serve, "Host", *words, "--drain-s", "1", "--expiry-s", "9", *files)["policy"]
     assert (given.tls_cert, given.tls_key, given.tls_client_ca) == (Path("cert.pem"), Path("key.pem"), Path("callers.pem"))
     assert (given.token_file, given.drain_s, given.expiry_s) == (tmp_path / "token", 1.0, 9.0)
 
