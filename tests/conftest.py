@@ -42,7 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
 # A kernel's first call compiles it, for half a minute, and leaves it on disk for every later process. The files that compile the three
 # groups of kernels come first, one a worker, so that no two processes compile the same ones; then what takes longest, so that no worker is
 # left alone with it at the end.
-FIRST = ("gaussians/test_rasterize_hard_cases.py", "semantic_map/test_draw.py", "gaussians/test_rasterize_gradient.py")
+FIRST = ("gaussians/test_rasterize_hard_cases.py", "semantic_map/test_draw.py", "gaussians/test_gradient_gsplat.py")
 LONG = ("plugins", "alpasim", "runtime", "gaussians", "training", "cli", "renderers", "fixers", "bench")
 
 

@@ -164,8 +164,7 @@ class UntilDecided:
 def gate(
     until: UntilDecided,
     what: Annotated[What, Only("policy", "seeds", "overrides")],
-    options: Annotated[RunOptions, Only("images")],
-    design: Annotated[Design, Only("order", "order_seed", "budget")],
+    design: Annotated[Design, Only("order", "budget")],
     where: Where,
     run: Annotated[Path | None, Positional("A run folder; with --until-decided it is written.")] = None,
     gate_file: Annotated[str, Flag("A gate file, or the name of a shipped gate.", "--gate")] = "default",
@@ -193,7 +192,7 @@ def gate(
             do_this = "name them: --scenes SUITE --renderer A,B (one, with --baseline-file)"
             raise InputError(DOING, "--until-decided", "no scenes or renderers", do_this)
         what = replace(what, scenarios=until.scenes, renderer=until.renderer)
-        raise typer.Exit(_until_decided(run, gate_file, until, what, options, design, baseline_file, out, as_json, how))
+        raise typer.Exit(_until_decided(run, gate_file, until, what, design, baseline_file, out, as_json, how))
     driving = {
         "--scenes": until.scenes, "--renderer": until.renderer, "--executor": not how["executor"].is_local, "--store": where.store,
     }  # fmt: skip
@@ -231,7 +230,6 @@ def _until_decided(
     gate_file: str,
     until: UntilDecided,
     what: What,
-    options: RunOptions,
     design: Design,
     baseline_file: Path | None,
     out: Path | None,
@@ -240,7 +238,7 @@ def _until_decided(
 ) -> int:
     """Drive until the gate's margins are decided, judge, write the gate's files, and return the exit code."""
     spec, source = load_gate(gate_file)
-    options = replace(options, preset=spec.preset or options.preset, baseline=spec.baseline)
+    options = RunOptions(preset=spec.preset or RunOptions.preset, baseline=spec.baseline)
     plan = plan_of(what, options, stored=baseline_file is not None)
     stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec.baseline, spec.max_missing)
     population = population_of(until.population, spec.max_missing, f"max_missing {spec.max_missing:g} of {source}")

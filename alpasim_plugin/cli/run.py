@@ -44,7 +44,7 @@ Examples:
 
 - `simrun --renderer clean --policy log-replay ../data/av2/7fab2350`
 
-- `simrun --renderer clean,3dgs --executor ray --cores 2 suites/urban`
+- `simrun --renderer clean,3dgs --executor 'ray?cores=2' suites/urban`
 
 - `simrun --renderer clean,3dgs --executor slurm:cpu --workers 64 --store s3://bucket/night suites/urban`
 """

@@ -54,14 +54,13 @@ def view(
     cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
     width: Annotated[int, Flag("Frames wider than this are made smaller, pixels.", min=64, max=4096)] = 512,
-    every: Annotated[int, Flag("Keep every n-th camera frame.", min=1)] = 1,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run."""
     root, of_rollout = find_cell(what, DOING)
     wanted = narrowed(what, of_rollout, asked, DOING)
-    options = Options(int(max_mb * MB), Fineness(every, width), camera)
+    options = Options(int(max_mb * MB), Fineness(width_px=width), camera)
     if serve is not None:
         if out is not None:
             raise InputError(DOING, "--serve and --out", "both", "give one of them")
