@@ -139,6 +139,10 @@ class RenderRequest:
     ahead: Sequence[RenderRequest] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
 
 
+# Facts of a frame that a fixer made of recorded ones: shares of the picture, 0 to 1, and both by cell (`fixers.trust`).
+RECORDED_SHARE, GUESSED_SHARE, TRUST_CELLS = "recorded_share", "guessed_share", "trust_cells"
+
+
 @dataclass(frozen=True)
 class Frame:
     """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote, video)."""

@@ -24,8 +24,7 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.trust import trust
 from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
 from alpasim_plugin.nets.machine_probe import take_threads
-from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
-from alpasim_plugin.nets.pixel_source import content_key, pixel_noise, sparse_source
+from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState, content_key, pixel_noise, sparse_source
 from alpasim_plugin.nets.schedule import from_names, interpolant
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, F64, U8
+from alpasim_plugin.core.types import F32, F64, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
 
-# How much of the picture the references are, and how much the fixer itself has made up, 0 to 1; and both by cell of the picture.
-RECORDED, GUESSED, CELLS = "recorded_share", "guessed_share", "trust_cells"
 MADE_UP = 0.25  # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
 CELL_PX, MOST_COLUMNS = 16, 32  # side of a cell; a picture wider than 512 pixels has larger ones
 LEVELS = 15  # a share is a hexadecimal digit
@@ -22,8 +20,8 @@ def trust(output: F32, render: F32, recorded: F32) -> dict[str, float | str]:
         recorded: ``(H, W)`` share of the references in each pixel.
 
     Returns:
-        `RECORDED` and `GUESSED`: means over the picture. `CELLS`: both by cell, as `trust_cells` reads it. Sums are numpy's, in double
-        precision: those of torch depend in their last bits on the number of threads, and facts must not.
+        `RECORDED_SHARE` and `GUESSED_SHARE`: means over the picture. `TRUST_CELLS`: both by cell, as `trust_cells` reads it. Sums are
+        numpy's, in double precision: those of torch depend in their last bits on the number of threads, and facts must not.
     """
     apart = np.abs(output - render)
     own = (apart[..., 0] + apart[..., 1] + apart[..., 2]) * np.float32(1 / (3 * MADE_UP))
@@ -40,8 +38,8 @@ def trust(output: F32, render: F32, recorded: F32) -> dict[str, float | str]:
 
     digits = np.rint(np.stack([by_cell(recorded), by_cell(guessed)], axis=-1) * LEVELS).astype(int)
     text = "".join(f"{digit:x}" for digit in digits.ravel().tolist())
-    means = {name: float(shares.mean(dtype=np.float64)) for name, shares in ((RECORDED, recorded), (GUESSED, guessed))}
-    return {**means, CELLS: f"{digits.shape[1]}x{digits.shape[0]}:{text}"}
+    means = {name: float(shares.mean(dtype=np.float64)) for name, shares in ((RECORDED_SHARE, recorded), (GUESSED_SHARE, guessed))}
+    return {**means, TRUST_CELLS: f"{digits.shape[1]}x{digits.shape[0]}:{text}"}
 
 
 def trust_cells(text: str) -> U8:
@@ -64,5 +62,5 @@ def trust_cells(text: str) -> U8:
     except ValueError as error:
         found = f"{text[:40]!r}"
         raise InputError(
-            "reading where a picture comes from", CELLS, found, "run the rollout again: its frames.jsonl is damaged"
+            "reading where a picture comes from", TRUST_CELLS, found, "run the rollout again: its frames.jsonl is damaged"
         ) from error

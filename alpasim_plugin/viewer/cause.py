@@ -21,12 +21,10 @@ from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.log import decode_image, read_asl
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
-from alpasim_plugin.viewer.cells import Wanted, cells_of
+from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_logs
 from alpasim_plugin.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from alpasim_plugin.viewer.page import as_json, fill
-from alpasim_plugin.viewer.page_data import cell_data, lens_data, read_logs
-from alpasim_plugin.viewer.pictures import jpeg, smaller
-from alpasim_plugin.viewer.trust_data import frame_rows, seen_before
+from alpasim_plugin.viewer.pictures import frame_rows, jpeg, seen_before, smaller
 from evaluators.metrics.outcomes import OUTCOMES, in_words, outcomes_of
 from evaluators.opening import Run
 

@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.run_folder.rows import Rollout, series_by_cell
-from alpasim_plugin.viewer.trust_data import Rows, seen_before
+from alpasim_plugin.viewer.pictures import Rows, seen_before
 from evaluators.opening import Run
 from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
 from evaluators.report.rollouts import SERIES, Event, events_of

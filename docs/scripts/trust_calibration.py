@@ -13,10 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, TRUST_CELLS
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.trust import CELL_PX, CELLS, LEVELS, MOST_COLUMNS, trust_cells
+from alpasim_plugin.fixers.trust import CELL_PX, LEVELS, MOST_COLUMNS, trust_cells
 from alpasim_plugin.lab.bench.quality import QualityClip, fixer_input
 from alpasim_plugin.lab.bench.quality_run import quality_clip
 from alpasim_plugin.lab.training.pair_store import PairDataset
@@ -33,8 +33,8 @@ def cells_of(clip: QualityClip, name: str) -> F64:
     rows, t = [], 0
     for block in refine_frames(fixer_input(clip, spec.settings), build(spec, scene_id=clip.name, seed=0, device="cpu", threads=1)):
         for frame in block.fixed:
-            if CELLS in frame.facts:
-                shares = trust_cells(str(frame.facts[CELLS])).reshape(-1, 2) / LEVELS
+            if TRUST_CELLS in frame.facts:
+                shares = trust_cells(str(frame.facts[TRUST_CELLS])).reshape(-1, 2) / LEVELS
                 before, after = (cell_errors(image, clip.truth[t]) for image in (clip.render[t], frame.rgb))
                 rows.append(np.column_stack([shares, before, after]))
             t += 1

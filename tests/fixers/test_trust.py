@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.trust import CELL_PX, CELLS, GUESSED, LEVELS, MADE_UP, MOST_COLUMNS, RECORDED, trust, trust_cells
-from alpasim_plugin.viewer.trust_data import cells_by_time, seen_before
+from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS
+from alpasim_plugin.fixers.trust import CELL_PX, LEVELS, MADE_UP, MOST_COLUMNS, trust, trust_cells
+from alpasim_plugin.viewer.pictures import seen_before, trust_by_time
 
 
 @pytest.mark.parametrize(("height", "width"), [(144, 256), (150, 250), (9, 7), (288, 512), (270, 600)])
@@ -17,9 +18,9 @@ def test_cells_are_the_means_of_their_pixels(height: int, width: int) -> None:
     output = render + rng.uniform(-0.4, 0.4, render.shape).astype(np.float32)
     found = trust(output, render, recorded)
     guessed = np.minimum(np.abs(output - render).mean(axis=2) / MADE_UP, 1) * (1 - recorded)
-    assert found[RECORDED] == pytest.approx(recorded.mean(), abs=1e-5)
-    assert found[GUESSED] == pytest.approx(guessed.mean(), abs=1e-5)
-    cells = trust_cells(str(found[CELLS]))
+    assert found[RECORDED_SHARE] == pytest.approx(recorded.mean(), abs=1e-5)
+    assert found[GUESSED_SHARE] == pytest.approx(guessed.mean(), abs=1e-5)
+    cells = trust_cells(str(found[TRUST_CELLS]))
     side = max(CELL_PX, int(np.ceil(width / MOST_COLUMNS)))
     assert cells.shape == (-(-height // side), -(-width // side), 2)
     assert cells.shape[1] <= MOST_COLUMNS
@@ -31,9 +32,9 @@ def test_cells_are_the_means_of_their_pixels(height: int, width: int) -> None:
 
 def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed() -> None:
     grey, zero = np.zeros((32, 48, 3), np.float32), np.zeros((32, 48), np.float32)
-    assert trust(grey, grey, zero) == {RECORDED: 0, GUESSED: 0, CELLS: "3x2:" + 6 * "00"}
-    assert trust(grey + 1, grey, zero)[CELLS] == "3x2:" + 6 * "0f"
-    assert trust(grey + 1, grey, zero + 1) == {RECORDED: 1, GUESSED: 0, CELLS: "3x2:" + 6 * "f0"}
+    assert trust(grey, grey, zero) == {RECORDED_SHARE: 0, GUESSED_SHARE: 0, TRUST_CELLS: "3x2:" + 6 * "00"}
+    assert trust(grey + 1, grey, zero)[TRUST_CELLS] == "3x2:" + 6 * "0f"
+    assert trust(grey + 1, grey, zero + 1) == {RECORDED_SHARE: 1, GUESSED_SHARE: 0, TRUST_CELLS: "3x2:" + 6 * "f0"}
 
 
 @pytest.mark.parametrize("text", ["", "2x1:00", "2x1:00zz", "2:0000", "-2x-1:0000"])
@@ -43,9 +44,12 @@ def test_a_text_that_is_none_is_refused(text: str) -> None:
 
 
 def test_a_page_says_what_was_seen_in_the_second_before() -> None:
-    rows = [{"t_us": t, "camera": "front", GUESSED: t / 1e7, RECORDED: 0.5, CELLS: "1x1:f0"} for t in range(0, 2_000_001, 500_000)]
+    rows = [
+        {"t_us": t, "camera": "front", GUESSED_SHARE: t / 1e7, RECORDED_SHARE: 0.5, TRUST_CELLS: "1x1:f0"}
+        for t in range(0, 2_000_001, 500_000)
+    ]
     assert seen_before(rows, 2_000_000).startswith("15 % of what it saw in the second before was made up by the fixer, 50 % was recorded")
     assert seen_before(rows, 9_000_000) == ""
     assert seen_before([{"t_us": 0, "camera": "front"}], 0) == ""
-    assert cells_by_time(rows, "front")[500_000] == "1x1:f0"
-    assert cells_by_time(rows, "side") == {}
+    assert trust_by_time(rows, "front")[500_000] == "1x1:f0"
+    assert trust_by_time(rows, "side") == {}

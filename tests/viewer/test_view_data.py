@@ -20,9 +20,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.run_folder.rows import series_by_cell
-from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, shown_by_default
+from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, check_wanted, index_data, read_logs, shown_by_default
 from alpasim_plugin.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
-from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.opening import read_run
 from evaluators.report.rollouts import SERIES, clock_zero_us, events_of

@@ -28,8 +28,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.lab.training.grid_term import grid_term
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
-from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState, pixel_source
 from alpasim_plugin.nets.reference_blend import Sources
 from alpasim_plugin.nets.schedule import interpolant
 

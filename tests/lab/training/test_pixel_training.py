@@ -18,8 +18,7 @@ from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
-from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, pixel_source
 from alpasim_plugin.nets.reference_blend import Sources, mix
 
 SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
