@@ -78,8 +78,8 @@ def words_of(values: F64) -> str:
     """Return mean and half width of the interval."""
     if len(values) < 2:
         return "too few clips"
-    interval = t_interval(values, "clips")
-    return f"{values.mean():.1f} ± {(interval.high - interval.low) / 2:.1f}"
+    high = t_interval(values, "clips").high
+    return f"{values.mean():.1f}" + ("" if high is None else f" ± {high - values.mean():.1f}")
 
 
 if __name__ == "__main__":
