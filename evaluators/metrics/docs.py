@@ -25,7 +25,8 @@ def metric_table() -> str:
         if name not in BENCHMARKS:
             better = {"none": "neither"}.get(one.direction, one.direction)
             accepted = f"{one.accepted:g}" if one.accepted else ""
-            said = (one.formula or one.help, one.reference, one.unit, better, one.aggregation, accepted, one.invalid)
+            reference = one.reference.removesuffix(", plan view")  # as all footprints: a rule of the page
+            said = (one.formula or one.help, reference, one.unit, better, one.aggregation, accepted, one.invalid)
             names.setdefault(said, []).append(f"`{name}`")
     return _table(HEAD, ((", ".join(some), *said) for said, some in names.items()))
 
