@@ -28,7 +28,7 @@ PAGES = {  # page -> the sections of the schema whose tables it holds, by the fi
     "scenario-keys.md": (),
 }
 LIMITS_PAGE = "limits.md"
-WORDS = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+WORDS = {float: "number", int: "integer", str: "text", bool: "`true`, `false`"}
 HEAD = "| key | type | default | meaning |\n|---|---|---|---|"
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
@@ -88,7 +88,7 @@ def _kind(field: FieldInfo) -> str:
 def _name(annotation: Any) -> str:
     origin, options = get_origin(annotation), get_args(annotation)
     if origin is Literal:
-        return " \\| ".join(f"`{a}`" for a in options)
+        return ", ".join(f"`{a}`" for a in options)
     if hasattr(annotation, "__metadata__"):
         return _name(options[0])
     if origin is dict:
@@ -111,6 +111,8 @@ def _default(field: FieldInfo) -> str:
         return "none"
     if isinstance(value, Part):
         return "see below"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
     if isinstance(value, tuple):
         return f"`[{', '.join(map(str, value))}]`"
     return f"`{value}`" if value not in ("", {}) else "empty"

@@ -14,7 +14,7 @@ PAGE = "metrics.md"
 BEGIN, END = "<!-- metrics: made by python -m evaluators.metrics.docs docs -->\n", "<!-- end of metrics -->\n"
 BEGIN_SCORES = "<!-- scores: made by python -m evaluators.metrics.docs docs -->\n"
 HEAD = ("metric", "per step", "measured at", "unit", "better", "over a rollout", "accepted", "invalid")
-SCORES_HEAD = ("score or part", "of a rollout", "unit")  # what the page says of all of them once: higher is better but for units, invalid by their preset
+SCORES_HEAD = ("score or part", "of a rollout")  # the page says the rest once, of all of them
 
 
 def metric_table() -> str:
@@ -37,7 +37,7 @@ def score_table() -> str:
     rows = []
     for name, one in BENCHMARKS.items():
         if not bound.search(name):
-            rows.append((", ".join(f"`{it}`" for it in BENCHMARKS if bound.sub("", it) == name), one.help, one.unit))
+            rows.append((", ".join(f"`{it}`" for it in BENCHMARKS if bound.sub("", it) == name), one.help))
     return _table(SCORES_HEAD, rows)
 
 
