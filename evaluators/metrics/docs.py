@@ -27,7 +27,8 @@ def metric_table() -> str:
             better = {"none": "neither"}.get(one.direction, one.direction)
             accepted = f"{one.accepted:g}" if one.accepted else ""
             reference = one.reference.removesuffix(", plan view")  # as all footprints: a rule of the page
-            said = (one.formula or one.help, reference, one.unit, better, one.aggregation, accepted, one.invalid.replace(UNKNOWN, "obstacles unknown"))
+            invalid = one.invalid.replace(UNKNOWN, "obstacles unknown")
+            said = (one.formula or one.help, reference, one.unit, better, one.aggregation, accepted, invalid)
             names.setdefault(said, []).append(f"`{name}`")
     return _table(HEAD, ((", ".join(some), *said) for said, some in names.items()))
 
