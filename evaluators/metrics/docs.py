@@ -14,7 +14,7 @@ PAGE = "metrics.md"
 BEGIN, END = "<!-- metrics: made by python -m evaluators.metrics.docs docs -->\n", "<!-- end of metrics -->\n"
 BEGIN_SCORES = "<!-- scores: made by python -m evaluators.metrics.docs docs -->\n"
 HEAD = ("metric", "per step", "measured at", "unit", "better", "over a rollout", "accepted", "invalid")
-UNKNOWN = "nothing is touched in a recorded drive whose standing obstacles were not looked for"  # the page says it once
+UNKNOWN = METRICS["collision_any"].invalid  # long, and of every contact: the page says it once
 SCORES_HEAD = ("score or part", "of a rollout")  # the page says the rest once, of all of them
 
 
