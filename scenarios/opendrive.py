@@ -3,7 +3,7 @@
 Lanes follow one another along sections, from road to road, and through junctions. A map lies in a scene's local frame by its geographic
 origin and the scene's pose on the earth.
 
-Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.opendrive_alpasim` reads the same roads by AlpaSim's rule instead.
+Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.usdz` reads the same roads by AlpaSim's rule instead.
 """
 
 from __future__ import annotations

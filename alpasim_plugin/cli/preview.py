@@ -36,6 +36,7 @@ from scenarios.load import load_scenario
 Flatten = Callable[[F64], F64]  # (N, 2 or 3) metres, world -> (N, 2) metres on the page
 
 DOING = "previewing a scenario"
+MOMENTS = 5  # that are shown, evenly from the first frame to the end
 MARGIN_M = 15.0
 MAX_HEIGHT, MIN_HEIGHT = 5.0, 1.6  # of the map, inches
 WIDTH = 13.0
@@ -58,7 +59,7 @@ class Preview:
     text: tuple[str, ...]
 
 
-def draw_preview(scenario: Scenario, path: Path, frames: int = 5, renderer: str = "clean") -> Preview:
+def draw_preview(scenario: Scenario, path: Path, renderer: str = "clean") -> Preview:
     """Draw a scenario into a PNG, or into an HTML page that holds it.
 
     The drive and all road users are drawn as recorded or scripted; reactive ones go other ways once a policy drives.
@@ -66,7 +67,6 @@ def draw_preview(scenario: Scenario, path: Path, frames: int = 5, renderer: str 
     Args:
         scenario: What is drawn.
         path: ``.png`` or ``.html``.
-        frames: How many moments, evenly from the first frame to the end.
         renderer: What the camera frames are rendered by.
 
     Raises:
@@ -76,7 +76,7 @@ def draw_preview(scenario: Scenario, path: Path, frames: int = 5, renderer: str 
     """
     if path.suffix not in (".png", ".html"):
         raise InputError(DOING, str(path), f"suffix {path.suffix!r}", "name it .png or .html")
-    times = [int(t) for t in np.linspace(scenario.start_us, scenario.end_us, frames)]
+    times = [int(t) for t in np.linspace(scenario.start_us, scenario.end_us, MOMENTS)]
     there = [actor for actor in scenario.actors if actor.track.t_us[0] <= scenario.end_us and actor.track.t_us[-1] >= scenario.start_us]
     facts = _facts(scenario, there)
     png = _figure(scenario, there, times, _camera_frames(scenario, times, renderer), facts)
@@ -236,7 +236,6 @@ def preview(
     out: Annotated[Path | None, Flag("PNG or HTML; by default SCENE.png here.", also="-o")] = None,
     seed: Annotated[int | None, Flag("Scene seed; by default the file's.", min=0)] = None,
     renderer: Annotated[str, Flag("What renders the camera frames.")] = "clean",
-    frames: Annotated[int, Flag("Moments shown.", min=2, max=12)] = 5,
     overrides: Overrides = (),
     overwrite: Overwrite = False,
     as_json: Json = False,
@@ -245,7 +244,7 @@ def preview(
     loaded = load_scenario(scenario, seed, overrides)
     path = out or Path(f"{slug(loaded.scene_id)}.png")
     refuse_existing(path, overwrite, DOING, "")
-    made = draw_preview(loaded, path, frames, renderer)
+    made = draw_preview(loaded, path, renderer)
     if as_json:
         print(
             json.dumps({"preview": str(path), "scene": loaded.scene_id, "times_s": made.times_s, "actors": made.actors, "facts": made.text})

@@ -21,7 +21,6 @@ from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options, write_page
-from alpasim_plugin.viewer.pictures import Fineness
 from alpasim_plugin.viewer.serve import RunServer, loopback
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_so_far
@@ -53,14 +52,13 @@ def view(
     camera: Annotated[str | None, Flag("Keep this camera alone.")] = None,
     cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
-    width: Annotated[int, Flag("Frames wider than this are made smaller, pixels.", min=64, max=4096)] = 512,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run."""
     root, of_rollout = find_cell(what, DOING)
     wanted = narrowed(what, of_rollout, asked, DOING)
-    options = Options(int(max_mb * MB), Fineness(width_px=width), camera)
+    options = Options(int(max_mb * MB), camera=camera)
     if serve is not None:
         if out is not None:
             raise InputError(DOING, "--serve and --out", "both", "give one of them")

@@ -1,1 +1,1 @@
-"""Reading with limits, atomic writes, checksums, locks, configuration with positions."""
+"""Reading with limits, atomic writes, checksums, locks, the cache, configuration with positions."""

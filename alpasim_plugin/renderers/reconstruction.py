@@ -31,8 +31,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneN
 from alpasim_plugin.io.cache import cached
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory, scene_key, scene_of
-from alpasim_plugin.renderers.reconstruction_files import read_model
-from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, recipe_of, reconstruction_key
+from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, read_model, recipe_of, reconstruction_key
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
 
 KIND = "reconstructions"

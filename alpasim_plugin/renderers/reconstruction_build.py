@@ -24,8 +24,7 @@ from alpasim_plugin.gaussians.fit.start import Start, start_from_depth
 from alpasim_plugin.gaussians.fit.views import PosedView, logged_views
 from alpasim_plugin.gaussians.scene.log_views import SkyView
 from alpasim_plugin.renderers.gaussian import scene_of
-from alpasim_plugin.renderers.reconstruction_files import write_model
-from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
+from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, write_model
 from alpasim_plugin.renderers.recorded import pose_errors
 
 FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in

@@ -75,10 +75,10 @@ def test_a_gate_that_drives_takes_the_options_of_a_decision(called: Any, tmp_pat
 
 def test_a_page_of_drives_gets_its_limits(called: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(view, "find_cell", lambda what, doing: (what, None))
-    more = ("--camera", "front", "--cells", "3", "--max-mb", "5", "--width", "128", "--seed", "1", "--serve", "0")
+    more = ("--camera", "front", "--cells", "3", "--max-mb", "5", "--seed", "1", "--serve", "0")
     given = called(view, "_serve", "view", str(tmp_path), *more)
     options = given["options"]
-    assert (options.camera, options.fine.width_px, options.max_bytes) == ("front", 128, 5_000_000)
+    assert (options.camera, options.max_bytes) == ("front", 5_000_000)
     assert given["wanted"].seeds == (1,)
 
 

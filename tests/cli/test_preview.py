@@ -33,9 +33,9 @@ def near(picture: np.ndarray, rgb: tuple[int, int, int]) -> int:
 def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.png"
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--frames", "3", "--json"]) == 0
+    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
-    assert (facts["actors"], facts["times_s"]) == (2, [0.0, 1.5, 3.0])
+    assert (facts["actors"], facts["times_s"]) == (2, [0.0, 0.75, 1.5, 2.25, 3.0])
     picture = cv2.imread(str(out))
     assert near(picture, EGO) > 200
     assert near(picture, LEAD) > 200
@@ -48,7 +48,7 @@ def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsy
 def test_a_page_holds_the_picture_and_asks_for_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.html"
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--frames", "2", "--seed", "4"]) == 0
+    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--seed", "4"]) == 0
     assert "scene seed 4 varies" in capsys.readouterr().out
     text = out.read_text()
     assert text.count("data:image/png;base64,") == 1
@@ -73,6 +73,6 @@ def test_a_background_is_named_with_what_it_covers(tmp_path: Path, capsys: pytes
     write_ply(tmp_path / "s.ply", GaussianCloud(means, quats, np.full((n, 3), 0.3), np.full(n, 0.9), np.full((n, 1, 3), 0.5)))
     scene = SCENE + f"background: {{file: {tmp_path / 's.ply'}}}\n"
     (tmp_path / "scene.yaml").write_text(scene.replace("3000000", "1000000"))
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "p.png"), "--frames", "2", "--json"]) == 0
+    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "p.png"), "--json"]) == 0
     (said,) = [line for line in json.loads(capsys.readouterr().out)["facts"] if line.startswith("background ")]
     assert "% of the route" in said

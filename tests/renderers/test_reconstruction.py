@@ -18,8 +18,7 @@ from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache, scene_of
 from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
 from alpasim_plugin.renderers.reconstruction_build import misplaced
-from alpasim_plugin.renderers.reconstruction_files import HASHES, read_model
-from alpasim_plugin.renderers.reconstruction_key import recipe_of, reconstruction_key
+from alpasim_plugin.renderers.reconstruction_key import HASHES, read_model, recipe_of, reconstruction_key
 from tests.gaussians.scene_maps import line, parked, road_lanes, straight, with_camera
 from tests.renderers.test_gaussian_renderers import psnr, request
 

@@ -29,7 +29,6 @@ ROUNDS, HUBER_PX = 8, 1.0  # of placing a point: Gauss-Newton steps, and the err
 ADJUSTING_ROUNDS = 12  # of correcting poses
 SIGMA_M, SIGMA_RAD = 0.05, 0.003  # of a given pose: what correction is likely
 LARGEST_ERROR_PX, LEAST_ANGLE_RAD = 3.0, 0.01  # of observations that adjust poses, and of their points
-GOOD_ERROR_PX = 1.0  # mean reprojection error of a point that is kept after that
 
 
 @dataclass(frozen=True, eq=False)
