@@ -15,8 +15,8 @@ import numpy as np
 from alpasim_plugin.core.types import F64, U8
 
 DISPLAY = "standard_fhd"
-# Beside a torch without CUDA only a torchvision without it loads, which this index has.
-HOW = "pip install cvvdp --extra-index-url https://download.pytorch.org/whl/cpu"
+# Its torchvision loads beside the torch that it was built for alone, so the two are best installed together.
+HOW = "pip install cvvdp in an environment of its own, which then has the torch that its torchvision fits"
 
 
 class ColourVideoVDP:
@@ -39,7 +39,7 @@ def load_metric() -> tuple[ColourVideoVDP | None, str]:
             warnings.simplefilter("ignore")
             package = importlib.import_module("pycvvdp")
     except ModuleNotFoundError as error:
-        return None, f"cvvdp_jod is not measured: there is no module {error.name!r}; install it: {HOW}"
+        return None, f"cvvdp_jod is not measured: there is no module {error.name!r}; {HOW}"
     except (ImportError, OSError, RuntimeError) as error:  # its own dependencies may not fit the torch that is here
-        return None, f"cvvdp_jod is not measured: {type(error).__name__}: {str(error).splitlines()[0]}; install what fits: {HOW}"
+        return None, f"cvvdp_jod is not measured: {type(error).__name__}: {str(error).splitlines()[0]}; {HOW}"
     return ColourVideoVDP(package), ""

@@ -147,12 +147,13 @@ def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tel
     """Return a picture for each photograph."""
     frames = []
     for i, shot in enumerate(taken):
-        frames.append(renderer.render(_request(scenario, shot)).rgb)
+        frames.append(renderer.render(request_of(scenario, shot)).rgb)
         tell(i + 1)
     return frames
 
 
-def _request(scenario: Scenario, shot: Shot) -> RenderRequest:
+def request_of(scenario: Scenario, shot: Shot) -> RenderRequest:
+    """Return the request of a frame at a photograph's pose and size."""
     one = shot.photograph
     T_rig_camera = inverse(interpolate(scenario.ego_log, one.t_us)) @ one.T_world_camera
     spec = CameraSpec(one.camera, shot.camera.width, shot.camera.height, shot.camera.K, T_rig_camera)
