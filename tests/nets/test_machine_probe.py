@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 import torch
 
@@ -25,6 +27,18 @@ def test_the_faster_precision_is_taken_and_its_error_recorded(monkeypatch, bf16_
     assert choice.name == name
     assert choice.as_dict()["error"] == (3e-3 if name == "bf16" else 1e-7)
     assert choice.as_dict()["probe"]["bf16_ms"] == bf16_ms
+
+
+def test_the_precision_does_not_depend_on_what_else_the_machine_does(monkeypatch):
+    convolve = machine_probe._convolve
+
+    def interrupted(image, kernel):
+        if image.dtype == torch.bfloat16:
+            time.sleep(0.05)
+        return convolve(image, kernel)
+
+    monkeypatch.setattr(machine_probe, "_convolve", interrupted)
+    assert machine_probe._time_precisions().bf16_ms < 50
 
 
 @pytest.mark.parametrize(("slowdown", "number"), [({1: 4.0, 2: 2.5}, 2), ({1: 4.0, 2: 3.8}, 1), ({1: 4.0, 2: 300.0}, 1)])
