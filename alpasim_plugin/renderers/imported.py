@@ -21,8 +21,9 @@ from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.renderers.gaussian import backend_of, camera_at, in_memory, scene_key
+from alpasim_plugin.renderers.gaussian import backend_of, in_memory, scene_key
 from alpasim_plugin.renderers.recorded import photograph_recording
+from alpasim_plugin.renderers.rolling import camera_at, draw_request
 
 TILE_M = 24.0  # the background is culled in blocks of this size
 OPAQUE = 0.5
@@ -46,10 +47,10 @@ class ImportedRenderer(Renderer):
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame at the shutter's end."""
-        camera = camera_at(request)
-        out = self._drawn(camera, request.actors)
-        rgb = np.clip(out.rgb * self.exposures.near(request.camera.name, camera.centre_world), 0.0, 1.0)
+        """Render one frame."""
+        out = draw_request(request, self._drawn, self.backend)
+        place = camera_at(request, request.T_world_camera[1]).centre_world
+        rgb = np.clip(out.rgb * self.exposures.near(request.camera.name, place), 0.0, 1.0)
         shown = replace(out, rgb=np.asarray(rgb, np.float32))
         self.stats = out.stats
         return Frame(request.t_us, request.camera.name, shown.to_uint8(), out.alpha, out.depth)

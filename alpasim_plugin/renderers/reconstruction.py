@@ -8,24 +8,27 @@ hashes.json         file name to SHA-256; written last
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from alpasim_plugin.core.types import Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F64, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.cache import cached
-from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory, scene_of
+from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, in_memory, scene_of
 from alpasim_plugin.renderers.imported import ImportedRenderer
 from alpasim_plugin.renderers.reconstruction_files import read_model
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, recipe_of, reconstruction_key
 from alpasim_plugin.renderers.recorded import built_recording
+from alpasim_plugin.renderers.rolling import draw_request
 
 KIND = "reconstructions"
 TILE_M = 24.0  # the background is culled in blocks of this size
@@ -53,12 +56,15 @@ class ReconstructionRenderer(Renderer):
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame at the shutter's end."""
-        camera = camera_at(request)
-        out = self.model.graph.render(camera, request.actors, self.threads, self.backend)
+        """Render one frame."""
+
+        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+            out = self.model.graph.render(camera, actors, self.threads, self.backend)
+            return replace(out, alpha=np.maximum(out.alpha, self.model.sky.share(camera)), depth=out.surface_depth())
+
+        out = draw_request(request, draw, self.backend)
         self.stats = out.stats
-        shown = np.maximum(out.alpha, self.model.sky.share(camera))
-        return Frame(request.t_us, request.camera.name, out.to_uint8(), shown, out.surface_depth())
+        return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return what the scenario's cameras saw along the log, at the poses that the reconstruction believes."""

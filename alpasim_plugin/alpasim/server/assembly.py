@@ -18,6 +18,7 @@ from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
+from alpasim_plugin.alpasim.server.shutters import Shutter
 from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource, read_masks
 from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.core.errors import InputError
@@ -119,6 +120,7 @@ class Settings:
         reliability: Fixed trust in an upstream's frames; None: from the distance to the recorded path.
         masks: Grey masks by camera.
         kept_scenes: Scenes that stay loaded.
+        shutter: Which shutters roll; see `shutters.exposure_of`.
     """
 
     renderer: str = "onefixer"
@@ -132,6 +134,7 @@ class Settings:
     reliability: float | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
     kept_scenes: int = 4
+    shutter: Shutter = "asked"
 
 
 @dataclass(frozen=True)
@@ -190,12 +193,12 @@ def assemble(settings: Settings) -> Assembled:
     source: FrameSource
     if settings.upstream is None:
         assert scenes is not None
-        source = LocalSource(scenes, busy, settings.threads)
+        source = LocalSource(scenes, busy, settings.threads, settings.shutter)
     else:
         channel = settings.upstream.channel()
         stub = Stub(channel, "SensorsimService")
         masks = read_masks(settings.masks)
-        source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads)
+        source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads, settings.shutter)
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
     frames = FrameServer(source, fixers, tree, busy)
     shaping = {
@@ -204,6 +207,7 @@ def assemble(settings: Settings) -> Assembled:
         "masks": {camera: file_digest(path, f"mask of {camera}") for camera, path in settings.masks.items()},
         "upstream_png": settings.upstream is None or settings.upstream.as_png,
         "maps": needs_map and scenes is not None,
+        "shutter": settings.shutter,
     }
     service = Sensorsim(frames, partial(version_of, spec, shaping), scenes, stub, verbatim=stub is not None and fixers is None)
     world_model = None
