@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import inverse, quat_from_matrix, se3, slerp
+from alpasim_plugin.core.geometry import inverse, quat_from_matrix, se3, slerp, transform_points
 from alpasim_plugin.core.types import F32, F64, Bool, RenderRequest
 
 Along = Literal["rows", "columns"]
@@ -110,7 +110,8 @@ def between(start: F64, end: F64, share: float) -> F64:
 def motion_px(request: RenderRequest) -> float:
     """Return by how many pixels a thing in the picture moves while the shutter is open, at most.
 
-    Of the street that is what is `NEAR_M` away or at infinity, at the picture's edge; of the road users in view their near side.
+    Of the street that is what is `NEAR_M` away or at infinity, at the picture's edge; of the road users in view their near side. Pixels are
+    those of the picture's middle: at the edge of a wide pinhole they are smaller, but those of the lens that it stands for are not.
     """
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
     K, (start, end) = request.camera.K, request.T_world_camera
@@ -120,23 +121,20 @@ def motion_px(request: RenderRequest) -> float:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     to_start = inverse(start) @ end
     turned, moved = rays @ to_start[:3, :3].T, to_start[:3, 3] / NEAR_M
-    moves = [slope_change(rays, turned), slope_change(rays, turned + moved)]
+    moves = [angle_between(rays, turned), angle_between(rays, turned + moved)]
     if request.actors:
         first = np.array([request.exposure.actors_start[name][:3, 3] for name in request.actors])
         last = np.array([T[:3, 3] for T in request.actors.values()])
-        before, after = (points @ inverse(T)[:3, :3].T + inverse(T)[:3, 3] for points, T in ((first, start), (last, end)))
+        before, after = (transform_points(inverse(T), points) for T, points in ((start, first), (end, last)))
         near_m = np.maximum(np.linalg.norm(after, axis=1) - USER_M, NEAR_M)
         seen = after[:, 2] > -USER_M
         moves.append(np.where(seen, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
-    return float(max(K[0, 0], K[1, 1]) * max(float(np.max(change)) for change in moves))
+    return float(max(K[0, 0], K[1, 1]) * max(float(np.max(move)) for move in moves))
 
 
-def slope_change(a: F64, b: F64) -> F64:
-    """Return how far apart the directions ``(N, 3)`` meet the plane at distance 1; those behind it count as their angle."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.linalg.norm(a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:], axis=1)
-    angle = np.arccos(np.clip(np.sum(a * b, axis=1) / np.linalg.norm(b, axis=1), -1.0, 1.0))
-    return np.asarray(np.where((a[:, 2] > 0.05) & (b[:, 2] > 0.05), apart, angle))
+def angle_between(a: F64, b: F64) -> F64:
+    """Return the angles, radians, between directions ``(N, 3)``."""
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
 
 
 def rolling(width: int, height: int, along: Along, backwards: bool) -> F32:
