@@ -10,6 +10,7 @@ it further where it is dark:
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +22,13 @@ import grpc
 import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
+from alpasim_plugin.alpasim.server.map_gate import contradiction
 from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import Lens, View, read_lens
+from alpasim_plugin.alpasim.server.views import Lens, View, read_lens, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
-from alpasim_plugin.core.shutter import bands
+from alpasim_plugin.core.shutter import at_share, bands
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.log.images import decode_image
@@ -39,6 +41,8 @@ NEAR_M, FAR_M = 0.25, 3.0  # distance from the recorded path where trust begins 
 FAR = 0.6  # above 0.5: a hole is never invented
 ESTIMATING = "estimating the reliability of an upstream's frame"
 DOING = "rendering a requested frame"
+MAP_OFF = "map-off"
+log = logging.getLogger("simrun.serve")
 MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
 
 
@@ -134,6 +138,28 @@ def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens, threads: int 
     return lens.image(out)
 
 
+def gated(rendered: Rendered, entry: SceneEntry, asked: RenderRequest, shown: U8, view: View, threads: int | None) -> Rendered:
+    """Take the map away from a frame that contradicts it, with an event ``map-off`` and a line in the log.
+
+    Args:
+        rendered: With a map.
+        entry: Its scene.
+        asked: The pinhole, poses and road users of ``shown``.
+        shown: The frame as that pinhole shows it.
+        view: For the log.
+        threads: Of the map rasteriser.
+    """
+    assert entry.scene_map is not None, "a frame with a map is of a scene with one"
+    T, actors = at_share(asked, 0.5) if asked.exposure is not None else (asked.T_world_camera[1], asked.actors)
+    found = contradiction(entry.scene_map, asked.camera, T, actor_boxes(actors, entry.scenario.actors), shown, threads)
+    if found is None:
+        return rendered
+    what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
+    found_at = f"{abs(found.aside_m)} m {'left' if found.aside_m > 0 else 'right'} of where the map has it"
+    log.warning("%s: the map is off: paint agrees %.2f with the map and %.2f %s", what, found.here, found.there, found_at)
+    return Rendered(replace(rendered.frame, events=(*rendered.frame.events, MAP_OFF)), None)
+
+
 class LocalSource:
     """Render scenes here, through the lens and with the shutter of the request.
 
@@ -165,7 +191,8 @@ class LocalSource:
             frame = entry.render(asked)
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
             sdmap = drawn_map(entry, asked, lens, self._threads)
-        return Rendered(lens.frame(frame), sdmap)
+        rendered = Rendered(lens.frame(frame), sdmap)
+        return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view, self._threads)
 
 
 class UpstreamSource:
@@ -238,14 +265,19 @@ class UpstreamSource:
         rgb = decoded(data, f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us")
         height, width = rgb.shape[:2]
         alpha = trusted_opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
-        sdmap = None
+        rendered = Rendered(Frame(view.t_us, view.camera, rgb, alpha), None)
         if self._scenes is not None:
             entry = self._scenes.get(view.scene_id, left)
             seen = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
             lens, sized = read_lens(seen.camera_intrinsics, width, height), replace(view, width=width, height=height)
             asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)), self._shutter)
             sdmap = drawn_map(entry, asked, lens, self._threads)
-        return Rendered(Frame(view.t_us, view.camera, rgb, alpha), sdmap)
+            if sdmap is not None:
+                straight = straight_of(seen.camera_intrinsics, width, height)
+                camera = CameraSpec(view.camera, *straight.size, straight.K, asked.camera.T_rig_camera)
+                shown = straight.image(rgb)
+                rendered = gated(replace(rendered, sdmap=sdmap), entry, replace(asked, camera=camera), shown, view, self._threads)
+        return rendered
 
     def _trust_in(self, view: View, left: CallTime) -> float:
         if self._trust is not None:
