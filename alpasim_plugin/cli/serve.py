@@ -54,6 +54,8 @@ def serve(
     history_mb: Annotated[int, Flag("Most memory of the histories, MiB.", min=16)] = 2048,
     reliability: Annotated[float | None, Flag("Fixed trust in upstream frames.", min=0.0, max=1.0)] = None,
     mask: Annotated[tuple[str, ...], Flag("Grey picture, white is trusted.", metavar="CAMERA=FILE")] = (),
+    render_width: Annotated[int | None, Flag("Make wider pictures this wide and enlarge them, pixels.", min=16)] = None,
+    shutter: Annotated[Literal["asked", "rolling", "global"], Flag("Which shutters roll: as asked, all, or none.")] = "asked",
     prefetch: Annotated[bool, Flag("Load all scenes before the port opens.")] = False,
     policy: HostPolicy = HostPolicy(),
     as_json: Annotated[bool, Flag("Print one JSON line when the port is open, and one at the end.", "--json")] = False,
@@ -76,6 +78,9 @@ def serve(
         expiry_s=policy.expiry_s,
         reliability=reliability,
         masks={camera: Path(file) for camera, file in masks.items()},
+        shutter=shutter,
+        render_width=render_width,
+        says_costs=device == "cpu",
     )
     made = assemble(settings)
     if prefetch and made.scenes is not None:

@@ -128,6 +128,14 @@ class SensorSpec:
     interval_us: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """When a rolling shutter exposes the pixels of a frame; see `core.shutter`."""
+
+    share: F32  # (H, W), (H, 1) or (1, W): 0 at shutter start, 1 at its end; NaN: nobody looks at that pixel
+    actors_start: Mapping[str, F64]  # T_world_box (4, 4) at shutter start, of the same actors as at its end
+
+
 @dataclass(frozen=True)
 class RenderRequest:
     """One frame to render."""
@@ -137,6 +145,7 @@ class RenderRequest:
     T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
     ahead: Sequence[RenderRequest] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
+    exposure: Exposure | None = None  # of a rolling shutter; None: all pixels are exposed at the shutter's end
 
 
 # Facts of a frame that a fixer made of recorded ones: shares of the picture, 0 to 1, and both by cell (`fixers.trust`).

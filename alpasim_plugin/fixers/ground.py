@@ -53,13 +53,18 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, box
     by_ground = [warp(_hidden_by_users(picture), view, boxes, FREE_SHARE) for picture in pictures]
     ground = view.depth > 0
     if len(pictures) > 1:
-        size = max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
+        size = window_px(K)
         own = [image[lower] for image in by_depth[:2]]
         better = _disagreement(by_ground[0], by_ground[1], size) <= _disagreement(own[0], own[1], size) + PREFERENCE * size**2
         ground &= better | (target.depth[lower] <= 0)
     for image, on_ground in zip(by_depth, by_ground, strict=True):
         cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
     return tuple(by_depth)
+
+
+def window_px(K: F64) -> int:
+    """Return the side of the window in which two recorded frames are compared, pixels; odd."""
+    return max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
 
 
 def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> F32:

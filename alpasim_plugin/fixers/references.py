@@ -17,8 +17,9 @@ from typing import Literal
 import numpy as np
 
 from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest, Trajectory
-from alpasim_plugin.fixers.ground import carry, with_users
+from alpasim_plugin.fixers.ground import carry, window_px, with_users
 from alpasim_plugin.fixers.warp import Picture, WarpTarget
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
@@ -103,15 +104,25 @@ class ReferenceSession:
         """
         if frame.depth is None:
             return ()
-        T_world_camera = request.T_world_camera[-1]
+        T_world_camera = request.T_world_camera[1]
         last = self._last.get(frame.camera, ())
         chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
         if self.hysteresis:
             self._last[frame.camera] = chosen
-        target = WarpTarget(request.camera.K, T_world_camera, frame.depth, request.actors)
         at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
         T_world_rig = se3(self._ego_log.xyz[at], self._ego_log.quat[at])
-        return carry([self._picture(i) for i in chosen], target, T_world_rig, self._boxes)
+        pictures = [self._picture(i) for i in chosen]
+        out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in pictures)
+        around = window_px(request.camera.K)  # what `carry` decides of a pixel depends on those around it
+        for band in bands(request):
+            top, end = max(band.rows.start - around, 0), min(band.rows.stop + around, len(frame.depth))
+            K = request.camera.K.copy()
+            K[1, 2] -= top
+            target = WarpTarget(K, band.T_world_camera, frame.depth[top:end], band.actors)
+            own = slice(band.rows.start - top, band.rows.stop - top), band.columns
+            for whole, part in zip(out, carry(pictures, target, T_world_rig, self._boxes), strict=True):
+                band.put(whole, part[own])
+        return out
 
     def _picture(self, i: int) -> Picture:
         if i not in self._pictures:

@@ -23,6 +23,7 @@ class PinholeCamera:
         height: Pixels.
         K: ``(3, 3)`` intrinsics in pixels, no skew.
         T_camera_world: ``(4, 4)`` rigid transform that maps world points, metres, to camera points.
+        whole: `slope_limits` of the picture that this is a window of; None: it is a whole picture.
 
     Raises:
         InputError: A size below 1, intrinsics with skew or without positive focal lengths, or a transform that is not rigid.
@@ -32,6 +33,7 @@ class PinholeCamera:
     height: int
     K: F64
     T_camera_world: F64
+    whole: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
@@ -61,6 +63,13 @@ class PinholeCamera:
         f = width / (2 * np.tan(hfov_rad / 2))
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
         return cls.from_pose(width, height, K, np.eye(4) if T_world_camera is None else T_world_camera)
+
+    def window(self, rows: slice, columns: slice) -> PinholeCamera:
+        """Return the camera of a part of the picture: its pixels show what those of the whole do."""
+        K = self.K.copy()
+        K[:2, 2] -= columns.start, rows.start
+        size = columns.stop - columns.start, rows.stop - rows.start
+        return PinholeCamera(*size, K, self.T_camera_world, self.slope_limits())
 
     @property
     def fx(self) -> float:
@@ -92,6 +101,8 @@ class PinholeCamera:
 
         They lie 30 % of the half view outside the image's edges, so that splats just out of view do not become streaks.
         """
+        if self.whole is not None:
+            return self.whole
         margin_x = SLOPE_MARGIN * self.width / (2 * self.fx)
         margin_y = SLOPE_MARGIN * self.height / (2 * self.fy)
         return (

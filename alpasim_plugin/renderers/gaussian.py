@@ -1,7 +1,7 @@
 """Render Gaussian scenes: ``clean``, the scene as built, and the surrogate of a bad reconstruction of it.
 
-Rolling shutter is not modelled: a frame is rendered at its end pose. At 10 m/s and a read-out of 30 ms the ego moves 0.3 m during a frame,
-and no policy here uses more than the pose at the frame's time; the request carries both poses for renderers that do.
+A frame is drawn at the shutter's end, unless its request says when its pixels are exposed (`renderers.rolling`). Runs of this project do
+not say so, and no policy here uses more than the pose at the frame's time; a request of AlpaSim does.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.background import read_background
 from alpasim_plugin.renderers.recorded import built_recording
+from alpasim_plugin.renderers.rolling import draw_request
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
@@ -63,9 +64,13 @@ class CleanRenderer(Renderer):
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame at the shutter's end."""
-        camera, complete = camera_at(request), self.scenario.background is None
-        return self._frame(request, self.scene.render(camera, request.actors, self.threads, self.backend, sky_in_alpha=complete))
+        """Render one frame."""
+        complete = self.scenario.background is None
+
+        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+            return self.scene.render(camera, actors, self.threads, self.backend, sky_in_alpha=complete)
+
+        return self._frame(request, draw_request(request, draw, self.backend))
 
     def _frame(self, request: RenderRequest, out: RasterOutput) -> Frame:
         self.stats = out.stats
@@ -83,16 +88,18 @@ class SurrogateRenderer(CleanRenderer):
         """Render one frame; how bad it is follows the rig's lateral distance from the logged path."""
         w = self.surrogate.weight(request.T_world_camera[1] @ inverse(request.camera.T_rig_camera))
         graph = self._graph(w)
-        poses: dict[str, F64] = {}
-        for actor_id, pose in request.actors.items():
-            poses[actor_id] = self.surrogate.pose(actor_id, pose, request.t_us, self.seed, w)
-            if actor_id + GHOST in graph.actors:
-                poses[actor_id + GHOST] = self.surrogate.ghost_pose(actor_id, pose, request.t_us, self.seed, w)
-        camera = camera_at(request)
-        out = graph.render(camera, poses, self.threads, self.backend)
         gain = self.surrogate.gain(request.t_us, self.seed, w)
-        shown = np.maximum(out.alpha, self.sky.share(camera))
-        return self._frame(request, replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0), alpha=shown))
+
+        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+            poses: dict[str, F64] = {}
+            for actor_id, pose in actors.items():
+                poses[actor_id] = self.surrogate.pose(actor_id, pose, request.t_us, self.seed, w)
+                if actor_id + GHOST in graph.actors:
+                    poses[actor_id + GHOST] = self.surrogate.ghost_pose(actor_id, pose, request.t_us, self.seed, w)
+            out = graph.render(camera, poses, self.threads, self.backend)
+            return replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0), alpha=np.maximum(out.alpha, self.sky.share(camera)))
+
+        return self._frame(request, draw_request(request, draw, self.backend))
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return the scene as built, as its cameras saw it along the log; depth is the built scene's too."""
@@ -118,12 +125,6 @@ def backend_of(device: str) -> Backend:
     if device not in ("cpu", "cuda"):
         raise InputError("choosing a rasteriser", f"device {device!r}", "no such device", "use cpu or cuda")
     return "cpu" if device == "cpu" else "gsplat"
-
-
-def camera_at(request: RenderRequest) -> PinholeCamera:
-    """Return the camera at the shutter's end."""
-    spec = request.camera
-    return PinholeCamera.from_pose(spec.width, spec.height, spec.K, request.T_world_camera[1])
 
 
 def scene_of(scenario: Scenario) -> SceneGraph:

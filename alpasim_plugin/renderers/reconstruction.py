@@ -30,9 +30,10 @@ from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.io.cache import cached
 from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory, scene_key, scene_of
+from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, in_memory, scene_key, scene_of
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, read_model, recipe_of, reconstruction_key
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
+from alpasim_plugin.renderers.rolling import camera_at, draw_request
 
 KIND = "reconstructions"
 TILE_M = 24.0  # the background is culled in blocks of this size
@@ -61,12 +62,15 @@ class ReconstructionRenderer(Renderer):
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame at the shutter's end."""
-        camera = camera_at(request)
-        out = self.model.graph.render(camera, request.actors, self.threads, self.backend)
+        """Render one frame."""
+
+        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+            out = self.model.graph.render(camera, actors, self.threads, self.backend)
+            return replace(out, alpha=np.maximum(out.alpha, self.model.sky.share(camera)), depth=out.surface_depth())
+
+        out = draw_request(request, draw, self.backend)
         self.stats = out.stats
-        shown = np.maximum(out.alpha, self.model.sky.share(camera))
-        return Frame(request.t_us, request.camera.name, out.to_uint8(), shown, out.surface_depth())
+        return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return what the scenario's cameras saw along the log, at the poses that the reconstruction believes."""
@@ -140,10 +144,10 @@ class ImportedRenderer(Renderer):
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame at the shutter's end."""
-        camera = camera_at(request)
-        out = self._drawn(camera, request.actors)
-        rgb = np.clip(out.rgb * self.exposures.near(request.camera.name, camera.centre_world), 0.0, 1.0)
+        """Render one frame."""
+        out = draw_request(request, self._drawn, self.backend)
+        place = camera_at(request, request.T_world_camera[1]).centre_world
+        rgb = np.clip(out.rgb * self.exposures.near(request.camera.name, place), 0.0, 1.0)
         shown = replace(out, rgb=np.asarray(rgb, np.float32))
         self.stats = out.stats
         return Frame(request.t_us, request.camera.name, shown.to_uint8(), out.alpha, out.depth)

@@ -27,7 +27,7 @@ from alpasim_plugin.semantic_map.kernels import SHAPE, STROKE
 from alpasim_plugin.semantic_map.kernels import shapes as project_shapes
 from alpasim_plugin.semantic_map.kernels import strokes as project_strokes
 from alpasim_plugin.semantic_map.prepare import CORNERS, EDGES, TRIANGLES, ActorBox, PreparedMap, Segments, Triangles, require_box
-from alpasim_plugin.semantic_map.raster import SAMPLES_1, SAMPLES_4, draw_bands, rows_of
+from alpasim_plugin.semantic_map.raster import BAND, SAMPLES_1, SAMPLES_4, draw_bands, rows_of
 from alpasim_plugin.semantic_map.style import WIDTH_DEFINED_AT_PX, MapStyle, box_class
 
 TABLE = 4096  # angles of the radius table; linear interpolation errs by less than 1e-4 px
@@ -159,7 +159,13 @@ _buffers = _Buffers()
 
 
 def draw_map(
-    scene: PreparedMap, camera: MapCamera, T_world_camera: F64, actors: Sequence[ActorBox] = (), *, threads: int | None = None
+    scene: PreparedMap,
+    camera: MapCamera,
+    T_world_camera: F64,
+    actors: Sequence[ActorBox] = (),
+    *,
+    threads: int | None = None,
+    rows: slice | None = None,
 ) -> U8:
     """Draw the map and the road users as ``(H, W, 3)`` uint8.
 
@@ -169,24 +175,26 @@ def draw_map(
         T_world_camera: ``(4, 4)`` pose of the camera (x right, y down, z forward).
         actors: Road users present at this instant.
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not depend on it.
+        rows: The part of the picture to draw and to return; None: all.
 
     Raises:
         InputError: A pose that is not rigid or not finite, a box of impossible size, or an invalid camera.
     """
+    first, last = (0, camera.height) if rows is None else (rows.start, rows.stop)
     lens, view, pose = view_of(scene, camera, T_world_camera)
     faces, edges = actor_geometry(actors, scene, pose)
     n_first, n_strokes, strokes = _strokes(scene.segments, edges, pose, lens, view)
     n_shapes, shapes = _shapes(scene.triangles, faces, pose, lens, view)
 
-    image: U8 = np.empty((camera.height, camera.width, 3), np.uint8)
+    image: U8 = np.empty((last, camera.width, 3), np.uint8)
     stroke_rows, shape_rows = np.empty((n_strokes, 2), np.int64), np.empty((n_shapes, 2), np.int64)
-    stretch = stretch_of(scene.style, camera)
+    stretch, begin = stretch_of(scene.style, camera), np.full(1, first // BAND, np.int64)
     rows_of(strokes, n_strokes, shapes, n_shapes, stretch, camera.height, stroke_rows, shape_rows)
     run_on_threads(
-        thread_count(threads), draw_bands, np.zeros(1, np.int64), strokes, n_first, n_strokes, stroke_rows, shapes, n_shapes, shape_rows,
+        thread_count(threads), draw_bands, begin, strokes, n_first, n_strokes, stroke_rows, shapes, n_shapes, shape_rows,
         stretch, scene.style.depth_max_m, samples_of(scene.style), image,
     )  # fmt: skip
-    return image
+    return image[first:]
 
 
 def samples_of(style: MapStyle) -> F64:

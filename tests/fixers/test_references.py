@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import inverse, se2
-from alpasim_plugin.core.types import F32, F64, U8, Actor, Box, CameraSpec, Frame, RecordedFrame, RenderRequest, Trajectory
+from alpasim_plugin.core.shutter import bands, rolling
+from alpasim_plugin.core.types import F32, F64, U8, Actor, Box, CameraSpec, Exposure, Frame, RecordedFrame, RenderRequest, Trajectory
 from alpasim_plugin.fixers.references import ReferenceIndex, ReferenceSession
 from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Lookup, Picture, WarpTarget, plain_coordinates, warp, warp_coordinates
 
@@ -199,3 +200,19 @@ def test_without_memory_the_same_view_has_the_same_references_whatever_came_befo
     found.of(*request(40.0, 2_000_000))
     again = found.of(*request(10.9, 500_000))
     assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
+
+
+def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row() -> None:
+    found, _ = session(hysteresis=False)
+    asked, frame = request(10.0, 500_000)
+    start, share = at(9.5, 0.0, 0.02), rolling(WIDTH, HEIGHT, "rows", backwards=False)
+    rolled = replace(asked, T_world_camera=np.stack([start, asked.T_world_camera[1]]), exposure=Exposure(share, {}))
+    images = found.of(rolled, frame)
+    assert len(images) == 2
+    assert (images[0] != found.of(asked, frame)[0]).any()
+    parts = bands(rolled)
+    assert len(parts) > 2
+    for band in parts:
+        T = np.stack([band.T_world_camera] * 2)
+        for image, alone in zip(images, found.of(replace(asked, T_world_camera=T), frame), strict=True):
+            np.testing.assert_array_equal(image[band.rows], alone[band.rows])

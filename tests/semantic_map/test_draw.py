@@ -396,3 +396,11 @@ def test_any_box_is_drawn_like_its_small_pieces(x, y, yaw, fish):
 def test_threads_do_not_change_the_picture():
     scene, boxes = street()
     np.testing.assert_array_equal(draw_map(scene, FISH, at(), boxes, threads=1), draw_map(scene, FISH, at(), boxes, threads=3))
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["pinhole", "ftheta"])
+@pytest.mark.parametrize("rows", [slice(0, 1), slice(70, 71), slice(31, 97), slice(100, 144), slice(0, 144)])
+def test_a_part_of_the_rows_is_that_part_of_the_picture(camera, rows):
+    scene, boxes = street()
+    whole = draw_map(scene, camera, at(), boxes)
+    np.testing.assert_array_equal(draw_map(scene, camera, at(), boxes, rows=rows), whole[rows])

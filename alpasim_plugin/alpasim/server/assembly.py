@@ -14,10 +14,12 @@ import grpc
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, resolve_served
+from alpasim_plugin.alpasim.server.costs import Announced
 from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
+from alpasim_plugin.alpasim.server.shutters import Shutter
 from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource, read_masks
 from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.core.errors import InputError
@@ -119,6 +121,9 @@ class Settings:
         reliability: Fixed trust in an upstream's frames; None: from the distance to the recorded path.
         masks: Grey masks by camera.
         kept_scenes: Scenes that stay loaded.
+        shutter: Which shutters roll; see `shutters.exposure_of`.
+        render_width: Pixels; wider pictures are made at this width and enlarged. None: all are made as asked.
+        says_costs: Log what a size costs before its first frame.
     """
 
     renderer: str = "onefixer"
@@ -132,6 +137,9 @@ class Settings:
     reliability: float | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
     kept_scenes: int = 4
+    shutter: Shutter = "asked"
+    render_width: int | None = None
+    says_costs: bool = False
 
 
 @dataclass(frozen=True)
@@ -179,6 +187,8 @@ def assemble(settings: Settings) -> Assembled:
         raise InputError(DOING, f"--upstream {settings.upstream.address}", found, "give a fixer (onefixer), identity, or no --upstream")
     if settings.upstream is None and (settings.masks or settings.reliability is not None):
         raise InputError(DOING, "--reliability, --mask", "our own renderer states its opacity", "use them with --upstream")
+    if settings.upstream is not None and settings.render_width is not None:
+        raise InputError(DOING, "--render-width", "the upstream chooses the size of its pictures", "use it without --upstream")
     busy = threading.Lock()
     fixers = None if spec.fixer is None else FixerCache(spec, settings.device, settings.threads)
     needs_map = fixers is not None and fixers.needs_map
@@ -190,20 +200,23 @@ def assemble(settings: Settings) -> Assembled:
     source: FrameSource
     if settings.upstream is None:
         assert scenes is not None
-        source = LocalSource(scenes, busy, settings.threads)
+        source = LocalSource(scenes, busy, settings.threads, settings.shutter)
     else:
         channel = settings.upstream.channel()
         stub = Stub(channel, "SensorsimService")
         masks = read_masks(settings.masks)
-        source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads)
+        source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads, settings.shutter)
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
-    frames = FrameServer(source, fixers, tree, busy)
+    costs = Announced(settings.render_width is None) if settings.says_costs and settings.upstream is None else None
+    frames = FrameServer(source, fixers, tree, busy, settings.render_width, costs)
     shaping = {
         "device": settings.device,
         "reliability": settings.reliability,
         "masks": {camera: file_digest(path, f"mask of {camera}") for camera, path in settings.masks.items()},
         "upstream_png": settings.upstream is None or settings.upstream.as_png,
         "maps": needs_map and scenes is not None,
+        "shutter": settings.shutter,
+        "render_width": settings.render_width,
     }
     service = Sensorsim(frames, partial(version_of, spec, shaping), scenes, stub, verbatim=stub is not None and fixers is None)
     world_model = None

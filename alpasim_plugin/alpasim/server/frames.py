@@ -6,9 +6,14 @@ import threading
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import cv2
+import numpy as np
+
 from alpasim_plugin.alpasim.server.caches import FixerCache, size_of
+from alpasim_plugin.alpasim.server.costs import Announced, scaled
 from alpasim_plugin.alpasim.server.history import HistoryTree, Node
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
@@ -41,11 +46,21 @@ class FrameServer:
         fixers: Fixes; None: frames are given as rendered, and no history is kept.
         tree: Histories.
         busy: Held while something is computed.
+        width: Wider pictures are made at this width and enlarged to the size asked for; None: all are made as asked.
+        costs: Says what a size costs before its first frame; None: nothing is said.
     """
 
-    def __init__(self, source: FrameSource, fixers: FixerCache | None, tree: HistoryTree[Answered], busy: threading.Lock) -> None:
+    def __init__(
+        self,
+        source: FrameSource,
+        fixers: FixerCache | None,
+        tree: HistoryTree[Answered],
+        busy: threading.Lock,
+        width: int | None = None,
+        costs: Announced | None = None,
+    ) -> None:
         self.source, self.tree = source, tree
-        self._fixers, self._busy = fixers, busy
+        self._fixers, self._busy, self._width, self._costs = fixers, busy, width, costs
         self._in_work: dict[bytes, threading.Event] = {}
         self._in_work_lock = threading.Lock()
         self.events: Counter[str] = Counter()
@@ -60,11 +75,24 @@ class FrameServer:
         views = [read_view(request) for request in requests]
         if (pixels := sum(view.width * view.height for view in views)) > MOST_PIXELS:
             raise InputError(DOING, f"{len(views)} frames", f"{pixels} pixels", f"ask for at most {MOST_PIXELS} in one call")
+        sizes = [(view.width, view.height) for view in views]
+        if self._width is not None:
+            views = [scaled(view, self._width) if view.width > self._width else view for view in views]
+        if self._costs is not None:
+            for request, view in zip(requests, views, strict=True):
+                self._costs.before(view, partial(self._thrown_away, request, left))
         if self._fixers is None:
             rendered = self.source.render(requests, views, left)
-            return [encode(item.frame.rgb, form) for item, form in zip(rendered, forms, strict=True)]
+            return [encode(self._sized(item.frame.rgb, size), form) for item, size, form in zip(rendered, sizes, forms, strict=True)]
         nodes = self._nodes(requests, views, left)
-        return [self._encoded(nodes[view.key], form) for view, form in zip(views, forms, strict=True)]
+        return [self._encoded(nodes[view.key], size, form) for view, size, form in zip(views, sizes, forms, strict=True)]
+
+    def _thrown_away(self, request: Request, left: CallTime, view: View) -> None:
+        """Make a frame that nobody gets, and that is no part of a history."""
+        (item,) = self.source.render([request], [view], left)
+        if self._fixers is not None:
+            with left.holding(self._busy):
+                self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, None)
 
     def _nodes(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> dict[bytes, Node[Answered]]:
         """Return the frame of every view. A frame that another call is working on is waited for, after this call's own are done."""
@@ -104,12 +132,16 @@ class FrameServer:
             size = size_of(answered) + NODE_BYTES + OBJECT_BYTES * len(view.objects)
             return self.tree.add(view, answered, size, parent)
 
-    def _encoded(self, node: Node[Answered], form: tuple[int, float]) -> bytes:
+    def _encoded(self, node: Node[Answered], size: tuple[int, int], form: tuple[int, float]) -> bytes:
         known = node.answers.get(form)
         if known is None:
-            known = encode(node.state.image, form)
+            known = encode(self._sized(node.state.image, size), form)
             self.tree.remember(node, form, known)
         return known
+
+    def _sized(self, image: U8, size: tuple[int, int]) -> U8:
+        """Return a picture at the size asked for, where it was made smaller; an upstream's picture has the size that the upstream chose."""
+        return image if self._width is None else enlarged(image, size)
 
     def _claim(self, keys: Sequence[bytes]) -> tuple[list[bytes], list[threading.Event]]:
         """Take the keys that nobody works on; return them and what to wait for instead of the others."""
@@ -139,6 +171,13 @@ def image_form(request: Request) -> tuple[int, float]:
     if not 1 <= quality <= 100:
         raise InputError(DOING, f"image_quality {quality}", "not between 1 and 100", "ask for 95")
     return request.image_format, quality if request.image_format == sensorsim_pb2.JPEG else 0.0
+
+
+def enlarged(image: U8, size: tuple[int, int]) -> U8:
+    """Return a picture at a size (width, height), between pixels bicubically; as it is where it has that size."""
+    if image.shape[1::-1] == size:
+        return image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def encode(image: U8, form: tuple[int, float]) -> bytes:

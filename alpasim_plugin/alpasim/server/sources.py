@@ -10,9 +10,10 @@ it further where it is dark:
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,10 +22,13 @@ import grpc
 import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
+from alpasim_plugin.alpasim.server.map_gate import contradiction
+from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import Lens, View, read_lens
+from alpasim_plugin.alpasim.server.views import Lens, View, read_lens, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
+from alpasim_plugin.core.shutter import at_share, bands
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.log.images import decode_image
@@ -37,6 +41,8 @@ NEAR_M, FAR_M = 0.25, 3.0  # distance from the recorded path where trust begins 
 FAR = 0.6  # above 0.5: a hole is never invented
 ESTIMATING = "estimating the reliability of an upstream's frame"
 DOING = "rendering a requested frame"
+MAP_OFF = "map-off"
+log = logging.getLogger("simrun.serve")
 MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
 
 
@@ -109,25 +115,63 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
     return poses | {track: pair[1] for track, pair in view.objects.items()}
 
 
-def drawn_map(entry: SceneEntry, view: View, lens: Lens, camera: CameraSpec, threads: int | None) -> U8 | None:
+def asked_of(entry: SceneEntry, request: Request, view: View, camera: CameraSpec, shutter: Shutter) -> RenderRequest:
+    """Return what is to be drawn by the pinhole that covers the request's lens.
+
+    Raises:
+        InputError: A track that the scene does not have.
+    """
+    actors = boxes_at(entry, view)
+    exposure = exposure_of(request.camera_intrinsics, view, actors, shutter)
+    return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
+
+
+def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens, threads: int | None) -> U8 | None:
     """Return the semantic map as the lens sees it; None where the fixer takes none."""
     if entry.scene_map is None:
         return None
-    boxes = actor_boxes(boxes_at(entry, view), entry.scenario.actors)
-    return lens.image(draw_map(entry.scene_map, camera, view.T_world_camera[1], boxes, threads=threads))
+    out: U8 = np.zeros((asked.camera.height, asked.camera.width, 3), np.uint8)
+    for band in bands(asked):
+        boxes = actor_boxes(band.actors, entry.scenario.actors)
+        part = draw_map(entry.scene_map, asked.camera, band.T_world_camera, boxes, threads=threads, rows=band.rows)
+        band.put(out, part[:, band.columns])
+    return lens.image(out)
+
+
+def gated(rendered: Rendered, entry: SceneEntry, asked: RenderRequest, shown: U8, view: View, threads: int | None) -> Rendered:
+    """Take the map away from a frame that contradicts it, with an event ``map-off`` and a line in the log.
+
+    Args:
+        rendered: With a map.
+        entry: Its scene.
+        asked: The pinhole, poses and road users of ``shown``.
+        shown: The frame as that pinhole shows it.
+        view: For the log.
+        threads: Of the map rasteriser.
+    """
+    assert entry.scene_map is not None, "a frame with a map is of a scene with one"
+    T, actors = at_share(asked, 0.5) if asked.exposure is not None else (asked.T_world_camera[1], asked.actors)
+    found = contradiction(entry.scene_map, asked.camera, T, actor_boxes(actors, entry.scenario.actors), shown, threads)
+    if found is None:
+        return rendered
+    what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
+    found_at = f"{abs(found.aside_m)} m {'left' if found.aside_m > 0 else 'right'} of where the map has it"
+    log.warning("%s: the map is off: paint agrees %.2f with the map and %.2f %s", what, found.here, found.there, found_at)
+    return Rendered(replace(rendered.frame, events=(*rendered.frame.events, MAP_OFF)), None)
 
 
 class LocalSource:
-    """Render scenes here, through the lens of the request, at the pose of the shutter's end.
+    """Render scenes here, through the lens and with the shutter of the request.
 
     Args:
         scenes: Scenes with their renderers.
         busy: Held while something is computed: renderers are no more than one at a time.
         threads: Threads of the map rasteriser.
+        shutter: Which shutters roll; see `shutters.exposure_of`.
     """
 
-    def __init__(self, scenes: SceneCache, busy: threading.Lock, threads: int | None = None) -> None:
-        self._scenes, self._busy, self._threads = scenes, busy, threads
+    def __init__(self, scenes: SceneCache, busy: threading.Lock, threads: int | None = None, shutter: Shutter = "asked") -> None:
+        self._scenes, self._busy, self._threads, self._shutter = scenes, busy, threads, shutter
 
     def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
         """Return one frame a request, in order.
@@ -142,12 +186,13 @@ class LocalSource:
         lens = read_lens(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
         camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
-        asked = RenderRequest(view.t_us, camera, view.T_world_camera, boxes_at(entry, view))
+        asked = asked_of(entry, request, view, camera, self._shutter)
         with left.holding(self._busy):
             frame = entry.render(asked)
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
-            sdmap = drawn_map(entry, view, lens, camera, self._threads)
-        return Rendered(lens.frame(frame), sdmap)
+            sdmap = drawn_map(entry, asked, lens, self._threads)
+        rendered = Rendered(lens.frame(frame), sdmap)
+        return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view, self._threads)
 
 
 class UpstreamSource:
@@ -160,6 +205,7 @@ class UpstreamSource:
         masks: Grey masks by camera.
         as_png: Ask for PNG whatever the caller asked for, so that the picture is not compressed twice.
         threads: Threads of the map rasteriser.
+        shutter: Which shutters roll, for the map; see `shutters.exposure_of`.
     """
 
     def __init__(
@@ -170,7 +216,9 @@ class UpstreamSource:
         masks: Mapping[str, U8] | None = None,
         as_png: bool = True,
         threads: int | None = None,
+        shutter: Shutter = "asked",
     ) -> None:
+        self._shutter: Shutter = shutter
         self._stub, self._scenes, self._trust, self._masks = stub, scenes, trust, masks or {}
         self._as_png, self._threads, self._has_batch = as_png, threads, True
         self._paths: dict[str, F64] = {}
@@ -217,12 +265,19 @@ class UpstreamSource:
         rgb = decoded(data, f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us")
         height, width = rgb.shape[:2]
         alpha = trusted_opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
-        sdmap = None
+        rendered = Rendered(Frame(view.t_us, view.camera, rgb, alpha), None)
         if self._scenes is not None:
             entry = self._scenes.get(view.scene_id, left)
-            lens = read_lens(without_windshield(request.camera_intrinsics), width, height)
-            sdmap = drawn_map(entry, view, lens, lens.spec(view.camera, np.eye(4)), self._threads)
-        return Rendered(Frame(view.t_us, view.camera, rgb, alpha), sdmap)
+            seen = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
+            lens, sized = read_lens(seen.camera_intrinsics, width, height), replace(view, width=width, height=height)
+            asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)), self._shutter)
+            sdmap = drawn_map(entry, asked, lens, self._threads)
+            if sdmap is not None:
+                straight = straight_of(seen.camera_intrinsics, width, height)
+                camera = CameraSpec(view.camera, *straight.size, straight.K, asked.camera.T_rig_camera)
+                shown = straight.image(rgb)
+                rendered = gated(replace(rendered, sdmap=sdmap), entry, replace(asked, camera=camera), shown, view, self._threads)
+        return rendered
 
     def _trust_in(self, view: View, left: CallTime) -> float:
         if self._trust is not None:

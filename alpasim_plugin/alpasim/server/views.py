@@ -218,11 +218,11 @@ def _straight(data: bytes, width: int, height: int) -> Straight:
     with _INVERTING:
         pixels = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) + np.float32(0.5) for n in size)), axis=-1)
         wanted, start = ((pixels * by - 0.5).astype(np.float32) for by in (1.0 / shrink, [1.0, height / size[1]]))
-        place = _sought(lens.resample, wanted, start)
+        place = sought(lens.resample, wanted, start)
     return Straight(np.diag([*shrink, 1.0]) @ lens.K, size, place)
 
 
-def _sought(there: F32, wanted: F32, start: F32) -> F32:
+def sought(there: F32, wanted: F32, start: F32) -> F32:
     """Invert a map of pixels by Newton's method, which converges from afar as a lens bends one way only.
 
     Args:

@@ -1,0 +1,157 @@
+"""The truth gate: does the map belong to the picture? A fixer paints what a map draws, and a wrong map would have it paint a wrong road.
+
+Paint is brighter than the road on both sides of it. So the lines of the drawn map are laid over the picture, and each piece of a line in a
+row of pixels is compared with equal pieces beside it: how often is it the brighter one, by `top hat`, which leaves what is narrower than
+`PAINT_SHARE` of the width? Half of the time by chance, nearly always where the line is there. That number is the *agreement* of a map.
+
+A picture may show no paint at all: an unmarked street, glare, a poor reconstruction. That is no evidence against the map. A map is
+contradicted where its lines are not found where it has them (agreement below `DOUBT`) and the same lines are found to one side of it
+(`FITS` or more at one of `ASIDE_M`): then the picture shows paint, and somewhere else. A map of another street whose lines fit nowhere is
+not told from a street without paint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
+
+WIDTH_PX = 480  # pictures are compared at this width
+PAINT_SHARE = 0.035  # of the width: what is broader is no paint
+WIDEST_SHARE = 0.08  # of the width: a run of line colour that is broader is a line across the view, without sides
+BESIDE = (-4, -3, -2, 2, 3, 4)  # pieces beside a line, in its own widths
+LEAST_PIECES = 40  # of lines in rows; fewer say nothing
+DOUBT, FITS = 0.56, 0.64
+NOTHING = prepare_map(LaneMap({}))
+ASIDE_M = (-2.2, -1.75, -1.3, -0.9, 0.9, 1.3, 1.75, 2.2)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Where lines of a drawn map cross rows of pixels: row, first column and one past the last, ``(N,)`` each."""
+
+    row: np.ndarray
+    first: np.ndarray
+    end: np.ndarray
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A picture that shows a map's lines beside where the map has them.
+
+    Attributes:
+        here, there: Agreement where the map has its lines, and at the place that fits best.
+        aside_m: How far that is to the left, metres.
+    """
+
+    here: float
+    there: float
+    aside_m: float
+
+
+def contradiction(
+    scene_map: PreparedMap, camera: CameraSpec, T_world_camera: F64, boxes: Sequence[ActorBox], rgb: U8, threads: int | None = None
+) -> Contradiction | None:
+    """Compare a picture with the map; None: they do not contradict each other.
+
+    Args:
+        scene_map: The map.
+        camera: The pinhole that made the picture.
+        T_world_camera: ``(4, 4)``.
+        boxes: Road users, which hide lines.
+        rgb: ``(H, W, 3)`` the picture.
+        threads: Of the map rasteriser.
+    """
+    small = shrunk(camera)
+    paint = top_hat(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA))
+    open_road = ~draw_map(NOTHING, small, T_world_camera, boxes, threads=threads).any(axis=2)
+
+    def found(aside_m: float) -> float | None:
+        T = T_world_camera.copy()
+        T[:3, 3] -= aside_m * leftwards(T_world_camera)  # who stands to the right sees the lines to the left
+        return agreement(pieces_of(line_pixels(draw_map(scene_map, small, T, threads=threads)) & open_road), paint)
+
+    here = found(0.0)
+    if here is None or here >= DOUBT:
+        return None
+    there = [(found(aside_m) or 0.0, aside_m) for aside_m in ASIDE_M]
+    best, aside_m = max(there)
+    return Contradiction(here, best, aside_m) if best >= FITS else None
+
+
+def shrunk(camera: CameraSpec) -> CameraSpec:
+    """Return the camera of a picture `WIDTH_PX` wide, or of the picture itself where it is no wider."""
+    if camera.width <= WIDTH_PX:
+        return camera
+    size = WIDTH_PX, max(round(camera.height * WIDTH_PX / camera.width), 1)
+    return replace(camera, width=size[0], height=size[1], K=np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.K)
+
+
+def leftwards(T_world_camera: F64) -> F64:
+    """Return the horizontal direction ``(3,)`` to the left of a camera."""
+    ahead = T_world_camera[:2, 2]
+    left = np.array([-ahead[1], ahead[0], 0.0])
+    return left / max(float(np.linalg.norm(left)), 1e-9)
+
+
+def line_pixels(drawn: U8) -> Bool:
+    """Return the pixels ``(H, W)`` of a drawn map that are paint: white or yellow, however faded."""
+    red, green, blue = (drawn[..., c].astype(np.int16) for c in range(3))
+    top = np.maximum(np.maximum(red, green), blue)
+    both = (top >= 60) & (red * 10 >= top * 9) & (green * 10 >= top * 9)
+    return np.asarray(both & ((blue * 10 >= top * 9) | (blue * 10 <= top * 2)))
+
+
+def top_hat(rgb: U8) -> U8:
+    """Return how much brighter ``(H, W)`` each pixel is than what lies on both sides of it in its row."""
+    side = max(5, int(rgb.shape[1] * PAINT_SHARE) | 1)
+    bright = np.ascontiguousarray(rgb[..., :2].max(axis=2))  # white and yellow paint alike
+    return np.asarray(cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), np.uint8)))
+
+
+def pieces_of(lines: Bool) -> Pieces:
+    """Return the runs of line pixels, row by row."""
+    step = np.diff(np.pad(lines.astype(np.int8), ((0, 0), (1, 1))), axis=1)
+    (row, first), (_, end) = np.nonzero(step == 1), np.nonzero(step == -1)
+    fits = (end - first >= 2) & (end - first <= WIDEST_SHARE * lines.shape[1])
+    return Pieces(row[fits], first[fits], end[fits])
+
+
+def agreement(pieces: Pieces, paint: U8) -> float | None:
+    """Return how often a piece of a line is brighter than a piece beside it, 0 to 1; ties count half. None: too few pieces.
+
+    Example:
+        >>> paint = np.zeros((60, 90), np.uint8)
+        >>> paint[:, 41] = 9
+        >>> rows, ones = np.arange(60), np.ones(60, int)
+        >>> agreement(Pieces(rows, 40 * ones, 43 * ones), paint), agreement(Pieces(rows, 50 * ones, 53 * ones), paint)
+        (1.0, 0.4166666666666667)
+    """
+    if len(pieces.row) < LEAST_PIECES:
+        return None
+    width = paint.shape[1]
+    size = pieces.end - pieces.first
+    own = _brightest(paint, pieces.row, pieces.first, pieces.end)
+    wins = compared = 0.0
+    for times in BESIDE:
+        first, end = pieces.first + times * size, pieces.end + times * size
+        inside = (first >= 0) & (end <= width)
+        beside = _brightest(paint, pieces.row[inside], first[inside], end[inside])
+        wins += float(np.sum(own[inside] > beside) + 0.5 * np.sum(own[inside] == beside))
+        compared += float(inside.sum())
+    return wins / compared if compared else None
+
+
+def _brightest(paint: U8, row: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the largest value of each run."""
+    if not len(row):
+        return np.zeros(0, np.uint8)
+    flat = np.append(paint.ravel(), np.uint8(0))  # so that a run may end with the picture
+    places = np.stack([row * paint.shape[1] + first, row * paint.shape[1] + end], axis=1).ravel()
+    return np.asarray(np.maximum.reduceat(flat, places)[::2])

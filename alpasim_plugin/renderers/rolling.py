@@ -1,0 +1,70 @@
+"""Draw a frame of a rolling shutter: each of its bands from the pose, and with the road users, of the band's instant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from alpasim_plugin.core.shutter import at_share, bands
+from alpasim_plugin.core.types import F64, RenderRequest
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.raster.rasterize import Backend
+
+Draw = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
+
+
+def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> RasterOutput:
+    """Draw a request's frame; with an exposure in `bands`, otherwise at the shutter's end.
+
+    Args:
+        request: What to draw.
+        draw: Draws a camera's picture with the road users at their boxes.
+        backend: Of ``draw``. It is given the window of each band, but gsplat the whole picture: its limits of slopes
+            (`PinholeCamera.slope_limits`) are its own, and would follow the window.
+
+    Returns:
+        The picture; a pixel that nobody looks at is black and opaque. Depth is along the axis of the pose at the pixel's time. ``stats``
+        are the largest of any band.
+    """
+    spec = request.camera
+    if request.exposure is None:
+        return draw(camera_at(request, request.T_world_camera[1]), request.actors)
+    out = _blank(spec.height, spec.width)
+    stats: dict[str, int] = {}
+    windows = backend != "gsplat"
+    for band in bands(request):
+        camera = camera_at(request, band.T_world_camera)
+        part = draw(camera.window(band.rows, band.columns) if windows else camera, band.actors)
+        at = (slice(None), slice(None)) if windows else (band.rows, band.columns)
+        for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
+            band.put(whole, drawn[at])
+        stats = {name: max(count, stats.get(name, 0)) for name, count in part.stats.items()}
+    return RasterOutput(out.rgb, out.alpha, out.depth, stats)
+
+
+def plain_draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
+    """Return the same as `draw_request`, by the definition: for each time of exposure the whole picture, of which its pixels are taken."""
+    assert request.exposure is not None, "a frame without exposure has no reference but itself"
+    spec = request.camera
+    share = np.broadcast_to(request.exposure.share, (spec.height, spec.width))
+    out = _blank(spec.height, spec.width)
+    for time in np.unique(share[~np.isnan(share)]):
+        T, actors = at_share(request, float(time))
+        part = draw(camera_at(request, T), actors)
+        mine = share == time
+        for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
+            whole[mine] = drawn[mine]
+    return out
+
+
+def camera_at(request: RenderRequest, T_world_camera: F64) -> PinholeCamera:
+    """Return the request's camera at a pose."""
+    spec = request.camera
+    return PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
+
+
+def _blank(height: int, width: int) -> RasterOutput:
+    shape = height, width
+    return RasterOutput(np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32))

@@ -1,0 +1,158 @@
+"""The truth gate: a map whose lines are painted beside where it has them is off; a picture without paint is no evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.alpasim.server.assembly import Settings, assemble
+from alpasim_plugin.alpasim.server.map_gate import (
+    DOUBT,
+    FITS,
+    Pieces,
+    agreement,
+    contradiction,
+    leftwards,
+    line_pixels,
+    shrunk,
+    top_hat,
+)
+from alpasim_plugin.alpasim.server.sources import MAP_OFF
+from alpasim_plugin.alpasim.server.status import CallTime
+from alpasim_plugin.core.geometry import interpolate, se2
+from alpasim_plugin.core.types import F64, U8, Box, CameraSpec, LaneMap, Marking
+from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.schema import wire_pose
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
+from alpasim_plugin.semantic_map.style import OPENGL
+from alpasim_plugin.wire import sensorsim_pb2
+from scenarios.load import load_scenario
+from tests.alpasim.service_cases import pinhole
+
+AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+SPEC = CameraSpec("front", 480, 270, np.array([[240.0, 0, 240], [0, 240.0, 135], [0, 0, 1]]), AHEAD)
+
+
+def road(aside_m: float = 0.0, dashed: bool = False) -> LaneMap:
+    """A straight road along x with three lines; the middle of its right lane is y = 0."""
+    paints = ("solid_white", "dashed_white" if dashed else "solid_yellow", "solid_white")
+    lines = [np.array([[-10.0, y + aside_m, 0.0], [150.0, y + aside_m, 0.0]]) for y in (5.25, 1.75, -1.75)]
+    return LaneMap({}, markings=tuple(Marking(line, paint) for line, paint in zip(lines, paints, strict=True)))  # type: ignore[arg-type]
+
+
+def prepared(aside_m: float = 0.0, **options: bool) -> PreparedMap:
+    return prepare_map(road(aside_m, **options))
+
+
+def photograph(contrast: int = 90, noise: float = 6.0, aside_m: float = 0.0, **options: bool) -> U8:
+    """A grey road with the paint of `road`, as thin as paint is, and a textured roadside."""
+    thin = draw_map(prepare_map(road(aside_m, **options), style=replace(OPENGL, line_px=5.0)), SPEC, AHEAD)
+    out = 80 + np.random.default_rng(0).normal(0, noise, (270, 480, 1)) + (thin.max(axis=2, keepdims=True) > 60) * contrast
+    out[:130] = 60 + 100 * np.random.default_rng(1).random((130, 480, 1))
+    return np.repeat(np.clip(out, 0, 255), 3, axis=2).astype(np.uint8)
+
+
+def judged(rgb: U8, scene_map: PreparedMap, T: F64 = AHEAD) -> Any:
+    return contradiction(scene_map, SPEC, T, (), rgb)
+
+
+@pytest.mark.parametrize("dashed", [False, True])
+@pytest.mark.parametrize("contrast", [25, 90])
+def test_the_right_map_stays_on(dashed: bool, contrast: int) -> None:
+    assert judged(photograph(contrast, dashed=dashed), prepared(dashed=dashed)) is None
+
+
+@pytest.mark.parametrize("aside_m", [1.75, -1.75, 0.9, -2.2])
+def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside_m: float) -> None:
+    found = judged(photograph(), prepared(aside_m))
+    assert found is not None
+    assert found.here < DOUBT
+    assert found.there >= FITS
+    assert found.aside_m == pytest.approx(-aside_m, abs=0.01)
+
+
+def test_a_picture_without_paint_is_no_evidence() -> None:
+    for rgb in (photograph(contrast=0), photograph(contrast=0, noise=40.0), np.zeros((270, 480, 3), np.uint8)):
+        assert judged(rgb, prepared()) is None
+        assert judged(rgb, prepared(1.75)) is None
+
+
+def test_a_map_without_lines_or_with_few_in_view_is_not_judged() -> None:
+    assert judged(photograph(), prepare_map(LaneMap({}))) is None
+    assert judged(photograph(), prepared(), se2(0, 0, np.pi) @ AHEAD @ np.diag([1.0, 1, 1, 1])) is None
+    small = replace(SPEC, width=48, height=27, K=np.diag([0.1, 0.1, 1]) @ SPEC.K)
+    tiny = cv2.resize(photograph(), (48, 27), interpolation=cv2.INTER_AREA)
+    assert contradiction(prepared(1.75), small, AHEAD, (), tiny) is None
+
+
+def test_a_road_user_hides_lines_from_the_comparison() -> None:
+    bus, striped = ActorBox(se2(8.0, 0.0, 0.0, 1.6), Box(6.0, 14.0, 3.2), "bus"), photograph(contrast=0)
+    lines = line_pixels(draw_map(prepared(1.75), SPEC, AHEAD)) & (np.arange(270)[:, None] > 150)
+    striped[np.roll(lines, 30, axis=1)] = 200  # the lines of the map, beside where it has them, painted on the bus
+    assert contradiction(prepared(1.75), SPEC, AHEAD, (bus,), striped) is None
+
+
+def test_a_large_picture_is_compared_at_a_small_width() -> None:
+    large = replace(SPEC, width=1920, height=1080, K=np.diag([4.0, 4, 1]) @ SPEC.K)
+    assert (shrunk(large).width, shrunk(large).height) == (480, 270)
+    np.testing.assert_allclose(shrunk(large).K, SPEC.K)
+    assert shrunk(SPEC) is SPEC
+    rgb = cv2.resize(photograph(), (1920, 1080))
+    assert contradiction(prepared(1.75), large, AHEAD, (), rgb) is not None
+    assert contradiction(prepared(), large, AHEAD, (), rgb) is None
+
+
+def test_left_of_a_camera_is_level_also_when_it_looks_down() -> None:
+    np.testing.assert_allclose(leftwards(AHEAD), [0, 1, 0])
+    down = AHEAD @ np.array([[1.0, 0, 0, 0], [0, 0.8, 0.6, 0], [0, -0.6, 0.8, 0], [0, 0, 0, 1]])
+    np.testing.assert_allclose(leftwards(down), [0, 1, 0], atol=1e-12)
+
+
+def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side() -> None:
+    paint = top_hat(np.random.default_rng(2).integers(0, 255, (200, 300, 3), dtype=np.uint8))
+    rows, ones = np.arange(200), np.ones(200, np.int64)
+    found = agreement(Pieces(rows, 100 * ones, 104 * ones), paint)
+    assert found == pytest.approx(0.5, abs=0.05)
+    assert agreement(Pieces(rows, 296 * ones, 300 * ones), paint) is not None
+    assert agreement(Pieces(rows[:9], ones[:9], 4 * ones[:9]), paint) is None
+
+
+def ask(size: tuple[int, int] = (240, 136)) -> Any:
+    scenario = load_scenario("smoke/straight")
+    t_us = scenario.start_us + 1_000_000
+    pose = wire_pose(interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera, "a test")
+    lens = pinhole(*size, "front")
+    lens.opencv_pinhole_param.focal_length_x = lens.opencv_pinhole_param.focal_length_y = 130
+    return sensorsim_pb2.RGBRenderRequest(
+        scene_id=scenario.scene_id, resolution_w=size[0], resolution_h=size[1], camera_intrinsics=lens, frame_start_us=t_us - 30_000,
+        frame_end_us=t_us, image_format=sensorsim_pb2.PNG, sensor_pose=sensorsim_pb2.PosePair(start_pose=pose, end_pose=pose),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("aside_m", "is_off"), [(0.0, False), (1.75, True)])
+def test_a_server_drops_a_wrong_map_and_says_so(
+    aside_m: float, is_off: bool, overrides: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    def served(*more: str, moved_m: float = aside_m) -> tuple[U8, int]:
+        made = assemble(Settings(renderer="onefixer+clean", scenes=["smoke/straight"], overrides=[*overrides, *more], threads=1))
+        assert made.scenes is not None
+        entry, asked = made.scenes.get(ask().scene_id), ask()
+        if entry.scene_map is not None:
+            lines = replace(entry.scene_map, origin=entry.scene_map.origin + np.array([0.0, moved_m, 0.0]))
+            made.scenes._loaded[asked.scene_id] = replace(entry, scene_map=lines)
+        return decode_image(made.service.frames.answers([asked], CallTime())[0]), made.service.frames.events[MAP_OFF]
+
+    image, events = served()
+    assert events == is_off
+    told = [record.message for record in caplog.records if "the map is off" in record.message]
+    assert len(told) == is_off
+    without, _ = served("uses_map=false")
+    assert np.array_equal(image, without) == is_off
+    if is_off:
+        assert "camera 'front'" in told[0]
+        assert "m right of where the map has it" in told[0]

@@ -1,0 +1,138 @@
+"""The shutter of a request: when each pixel is exposed, through any lens, and that a served frame shows it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.alpasim.server.assembly import Settings, assemble
+from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of, place_in_lens
+from alpasim_plugin.alpasim.server.sources import drawn_map
+from alpasim_plugin.alpasim.server.status import CallTime
+from alpasim_plugin.alpasim.server.views import read_lens, read_view
+from alpasim_plugin.core.geometry import interpolate, se2
+from alpasim_plugin.core.shutter import bands
+from alpasim_plugin.core.types import U8, Exposure, RenderRequest
+from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.schema import wire_pose
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.prepare import actor_boxes
+from alpasim_plugin.wire import sensorsim_pb2
+from scenarios.load import load_scenario
+from tests.alpasim.service_cases import pinhole
+from tests.alpasim.test_server_lenses import distorted, fisheye, ftheta
+
+SCENE = "smoke/lead_car"
+W, H = 96, 54
+DOWN, UP = sensorsim_pb2.ROLLING_TOP_TO_BOTTOM, sensorsim_pb2.ROLLING_BOTTOM_TO_TOP
+RIGHT, LEFT = sensorsim_pb2.ROLLING_LEFT_TO_RIGHT, sensorsim_pb2.ROLLING_RIGHT_TO_LEFT
+
+
+def ask(shutter_type: int = DOWN, turn_rad: float = 0.03, ms: int = 30, spec: sensorsim_pb2.CameraSpec | None = None) -> Any:
+    """Return the request of a frame of the recorded drive, the rig turning while the shutter is open."""
+    scenario = load_scenario(SCENE)
+    t_us = scenario.start_us + 2_000_000
+    start, end = (interpolate(scenario.ego_log, t) for t in (t_us - 1000 * ms, t_us))
+    poses = [wire_pose(T @ scenario.cameras[0].T_rig_camera, "a test") for T in (start, end @ se2(0, 0, turn_rad))]
+    asked = sensorsim_pb2.RGBRenderRequest(
+        scene_id=scenario.scene_id, resolution_w=W, resolution_h=H, camera_intrinsics=spec or pinhole(W, H, "front"),
+        frame_start_us=t_us - 1000 * ms, frame_end_us=t_us, image_format=sensorsim_pb2.PNG,
+        sensor_pose=sensorsim_pb2.PosePair(start_pose=poses[0], end_pose=poses[1]),
+    )  # fmt: skip
+    asked.camera_intrinsics.shutter_type = shutter_type
+    for actor in scenario.actors:
+        if not actor.is_static:
+            pair = [wire_pose(interpolate(actor.track, t), "a test") for t in (t_us - 1000 * ms, t_us)]
+            asked.dynamic_objects.add(track_id=actor.actor_id, pose_pair=sensorsim_pb2.PosePair(start_pose=pair[0], end_pose=pair[1]))
+    return asked
+
+
+def exposure(asked: Any, shutter: Shutter = "asked") -> Exposure | None:
+    view = read_view(asked)
+    return exposure_of(asked.camera_intrinsics, view, {name: pair[1] for name, pair in view.objects.items()}, shutter)
+
+
+@pytest.mark.parametrize("spec", [distorted(), fisheye(), ftheta(False), ftheta(True)])
+@pytest.mark.parametrize("shutter_type", [DOWN, UP, RIGHT, LEFT])
+def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec: Any, shutter_type: int) -> None:
+    asked = ask(shutter_type, spec=spec)
+    asked.resolution_w, asked.resolution_h = 160, 90
+    found, lens = exposure(asked), read_lens(asked.camera_intrinsics, 160, 90)
+    assert found is not None
+    assert lens.resample is not None
+    assert found.share.shape == lens.cover[::-1]
+    read = cv2.remap(found.share, lens.resample, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    rows, columns = np.mgrid[:90, :160]
+    expected = rows / 89 if shutter_type in (DOWN, UP) else columns / 159
+    expected = 1 - expected if shutter_type in (UP, LEFT) else expected
+    seen = np.ones_like(expected, bool) if lens.seen is None else lens.seen
+    assert not np.isnan(read[seen]).any()
+    assert np.abs(read - expected)[seen].max() < 0.3 / 89
+
+
+def test_what_the_lens_does_not_see_is_exposed_never() -> None:
+    lens = read_lens(ftheta(False), 320, 180)
+    _, sees = place_in_lens(lens)
+    used = np.zeros(lens.cover[::-1], bool)
+    assert lens.resample is not None
+    column, row = np.floor(lens.resample).astype(int).reshape(-1, 2).T
+    for dx in (0, 1):
+        for dy in (0, 1):
+            used[np.clip(row + dy, 0, lens.cover[1] - 1), np.clip(column + dx, 0, lens.cover[0] - 1)] = True
+    assert sees[used].all()
+    assert not sees.all()
+
+
+@pytest.mark.parametrize(
+    ("asked", "shutter", "rolls"),
+    [
+        (ask(DOWN), "asked", True),
+        (ask(sensorsim_pb2.GLOBAL), "asked", False),
+        (ask(sensorsim_pb2.UNKNOWN), "asked", False),
+        (ask(sensorsim_pb2.GLOBAL), "rolling", True),
+        (ask(UP), "rolling", True),
+        (ask(DOWN), "global", False),
+        (ask(DOWN, ms=0), "asked", False),
+    ],
+)
+def test_what_rolls(asked: Any, shutter: Shutter, rolls: bool) -> None:
+    found = exposure(asked, shutter)
+    assert (found is not None) == rolls
+    if found is not None:
+        assert (found.share[0, 0] < found.share[-1, 0]) == (asked.camera_intrinsics.shutter_type != UP)
+        assert set(found.actors_start) == {o.track_id for o in asked.dynamic_objects}
+
+
+def served(shutter: Shutter, asked: Any) -> U8:
+    made = assemble(Settings(renderer="clean", scenes=[SCENE], threads=1, shutter=shutter))
+    return decode_image(made.service.frames.answers([asked], CallTime())[0])
+
+
+def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_row() -> None:
+    asked = ask()
+    rolled, still, forced = served("asked", asked), served("global", asked), served("rolling", ask(sensorsim_pb2.GLOBAL))
+    np.testing.assert_array_equal(rolled, forced)
+    assert np.abs(rolled[: H // 2].astype(int) - still[: H // 2]).mean() > 3 * np.abs(rolled[-2:].astype(int) - still[-2:]).mean()
+
+
+def test_the_map_has_the_shutter_of_the_frame() -> None:
+    made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE], threads=1))
+    assert made.scenes is not None
+    asked = ask()
+    view, entry = read_view(asked), made.scenes.get(asked.scene_id)
+    lens = read_lens(asked.camera_intrinsics, W, H)
+    camera = lens.spec("front", np.eye(4))
+    boxes = {name: pair[1] for name, pair in view.objects.items()}
+    request = RenderRequest(view.t_us, camera, view.T_world_camera, boxes, exposure=exposure(asked))
+    drawn, still = drawn_map(entry, request, lens, 1), drawn_map(entry, replace(request, exposure=None), lens, 1)
+    assert drawn is not None
+    assert still is not None
+    assert (drawn != still).any()
+    assert entry.scene_map is not None
+    for band in bands(request):
+        users = actor_boxes(band.actors, entry.scenario.actors)
+        np.testing.assert_array_equal(drawn[band.rows], draw_map(entry.scene_map, camera, band.T_world_camera, users)[band.rows])

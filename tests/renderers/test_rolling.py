@@ -1,0 +1,118 @@
+"""A rolling shutter in bands against the definition, row by row, where it is hardest: a turning rig, a passing car."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.shutter import bands_of, rolling
+from alpasim_plugin.core.types import F64, Behaviour, Exposure, RenderRequest, Scenario
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.renderers.gaussian import clear_cache, scene_of
+from alpasim_plugin.renderers.rolling import Draw, draw_request, plain_draw_request
+from tests.gaussians.scene_maps import parked, straight
+
+SHUTTER_S = 0.03
+STANDS = se2(20.0, -1.8, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Iterator[Scenario]:
+    yield straight(actors=(replace(parked("car", 27.0, 1.8), is_static=False, behaviour=Behaviour()),))
+    clear_cache()
+
+
+@pytest.fixture(scope="module")
+def draw(scenario: Scenario) -> Draw:
+    def drawn(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+        return scene_of(scenario).render(camera, actors, 1, sky_in_alpha=True)
+
+    return drawn
+
+
+def case(scenario: Scenario, speed_mps: float = 0.0, turn_rad_s: float = 0.0, car_mps: float = 0.0) -> RenderRequest:
+    """A frame of a moving rig beside a car that drives along x."""
+    spec, start = scenario.cameras[0], STANDS
+    end = STANDS @ se2(speed_mps * SHUTTER_S, 0.0, turn_rad_s * SHUTTER_S)
+    car = [se2(27.0 + car_mps * t, 1.8, 0.0, 0.75) for t in (-SHUTTER_S, 0.0)]
+    exposure = Exposure(rolling(spec.width, spec.height, "rows", backwards=False), {"car": car[0]})
+    T = np.stack([start @ spec.T_rig_camera, end @ spec.T_rig_camera])
+    return RenderRequest(30_000, spec, T, {"car": car[1]}, exposure=exposure)
+
+
+def psnr(a: RasterOutput, b: RasterOutput) -> float:
+    return float(-10 * np.log10(max(float(np.mean((a.rgb.astype(float) - b.rgb) ** 2)), 1e-12)))
+
+
+HARD = {
+    "driving": {"speed_mps": 15.0},
+    "turning": {"speed_mps": 8.0, "turn_rad_s": 0.7},
+    "turning on the spot": {"turn_rad_s": -1.5},
+    "passing car": {"car_mps": -30.0},
+    "all": {"speed_mps": 15.0, "turn_rad_s": 0.3, "car_mps": -30.0},
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_bands_are_the_rows_to_rounding_where_the_end_pose_is_far_off(scenario: Scenario, draw: Draw, name: str) -> None:
+    request = case(scenario, **HARD[name])
+    truth, in_bands = plain_draw_request(request, draw), draw_request(request, draw, "cpu")
+    at_end = draw_request(replace(request, exposure=None), draw, "cpu")
+    assert psnr(in_bands, truth) > 37
+    assert psnr(in_bands, truth) > psnr(at_end, truth) + 15
+    assert np.quantile(np.abs(in_bands.rgb - truth.rgb), 0.999) < 0.12
+    both = (in_bands.alpha > 0.5) & (truth.depth > 0)
+    assert np.median(np.abs(in_bands.depth - truth.depth)[both]) < 0.02
+
+
+def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
+    scenario: Scenario, draw: Draw, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = case(scenario, **HARD["all"])
+    truth, errors = plain_draw_request(request, draw), []
+    for count in (1, 4, 16, request.camera.height):
+        monkeypatch.setattr("alpasim_plugin.renderers.rolling.bands", partial(lambda r, n: list(bands_of(r, n)), n=count))
+        errors.append(psnr(draw_request(request, draw, "cpu"), truth))
+    assert all(later > earlier + 6 for earlier, later in pairwise(errors)), errors
+    assert errors[-1] > 90  # windows begin at other places than the picture, so sums round otherwise
+
+
+def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario: Scenario, draw: Draw) -> None:
+    request = case(scenario)
+    np.testing.assert_array_equal(draw_request(request, draw, "cpu").rgb, draw_request(replace(request, exposure=None), draw, "cpu").rgb)
+
+
+def test_a_backend_without_windows_gives_the_same_picture(scenario: Scenario, draw: Draw) -> None:
+    request = case(scenario, **HARD["turning"])
+    assert psnr(draw_request(request, draw, "gsplat"), draw_request(request, draw, "cpu")) > 90
+
+
+def test_a_window_shows_what_the_whole_picture_does(scenario: Scenario, draw: Draw) -> None:
+    """Splats that reach into a window from far outside of it keep their shape."""
+    spec = scenario.cameras[0]
+    camera = PinholeCamera.from_pose(spec.width, spec.height, spec.K, STANDS @ spec.T_rig_camera)
+    whole = draw(camera, {})
+    rows, columns = slice(100, 107), slice(60, 200)
+    part = draw(camera.window(rows, columns), {})
+    assert np.abs(part.rgb - whole.rgb[rows, columns]).max() < 2e-3
+    assert camera.window(rows, columns).window(slice(0, 2), slice(3, 9)).slope_limits() == camera.slope_limits()
+
+
+@pytest.mark.parametrize("name", ["clean", "3dgs"])
+def test_renderers_roll_when_the_request_does(scenario: Scenario, name: str) -> None:
+    renderer = make_renderer(name, scenario)
+    request = case(scenario, **HARD["all"])
+    rolled, still = renderer.render(request), renderer.render(replace(request, exposure=None))
+    assert (rolled.rgb != still.rgb).mean() > 0.2
+    assert np.abs(rolled.rgb[-1].astype(int) - still.rgb[-1]).mean() < np.abs(rolled.rgb[80].astype(int) - still.rgb[80]).mean()
+    assert rolled.depth is not None
+    assert rolled.depth.shape == rolled.rgb.shape[:2]
+    assert renderer.render(request).rgb.tobytes() == rolled.rgb.tobytes()
