@@ -33,6 +33,7 @@ from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.self_test import run_self_test
+from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
 from evaluators.report.decision import judge_decided
@@ -193,7 +194,7 @@ def print_verdict(verdict: GateVerdict) -> None:
 
 def _self_test(gate_file: str, out: Path | None, workers: int | None, as_json: bool) -> int:
     spec, source = load_gate(gate_file)
-    root = out or Path("runs", f"gate-self-test-{spec.preset or 'paper'}")
+    root = out or Path("runs", f"gate-self-test-{spec.preset or DEFAULT}")
     began = time.perf_counter()
     result = run_self_test(spec, root, workers, ["simrun", *sys.argv[1:]], lambda: make_progress(as_json))
     took_s = time.perf_counter() - began

@@ -11,6 +11,7 @@ from alpasim_plugin.plugins.parts import names
 from alpasim_plugin.run_folder.sides import Row
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import Progress, execute_run
+from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.statistics.baselines import rows_of_run
 from evaluators.statistics.gate import GateSpec, GateVerdict, judge
@@ -76,7 +77,7 @@ def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequ
         progress: Creates a progress display, once for each of the two runs.
     """
     broken = broken_renderers()
-    options = RunOptions(preset=spec.preset or "paper", baseline=REFERENCE)
+    options = RunOptions(preset=spec.preset or DEFAULT, baseline=REFERENCE)
     plan = make_plan(load_suite(SUITE), [REFERENCE, *broken], [POLICY], [SEED], options)
     control = make_plan(load_suite(SUITE), [REFERENCE], [POLICY], [OTHER_SEED], options)
     runs = [(plan, root), (control, root / "control")]
