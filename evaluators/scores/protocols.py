@@ -76,7 +76,7 @@ def _navsim(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajector
         "nc": drive.contact(),
         "dac": drive.drivable(MARGIN_M),
         "ddc": drive.direction(),
-        "tlc": "the states of the traffic lights",
+        "tlc": drive.traffic_lights(),
         "ep": "the progress of PDM-Closed in the same scene",
         "ttc": drive.time_to_collision(),
         "lk": drive.lane_keeping(),

@@ -20,7 +20,7 @@ from evaluators.metrics.presets import preset as find_preset
 
 EVENTS = (
     "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane", "left_route", "stalled", "braked_without_cause",
-    "hard_brake", "wrong_way",
+    "hard_brake", "wrong_way", "red_light",
 )  # fmt: skip
 
 NEVER_ENGAGED = "the policy never took over: every step belongs to the warm-up"
