@@ -36,7 +36,7 @@ from alpasim_plugin.runtime.self_test import run_self_test
 from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
-from evaluators.report.decision import judge_decided
+from evaluators.report.verdict import judge_decided
 from evaluators.statistics.baselines import check_matches, read_baseline, rows_of_run, table_of_run, write_baseline
 from evaluators.statistics.gate import GateVerdict, judge_table, load_gate
 from evaluators.statistics.sequential.question import Question, stopping_note

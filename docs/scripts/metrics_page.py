@@ -1,14 +1,13 @@
-"""The table of metrics in docs/metrics.md, from the metrics themselves: ``python -m evaluators.metrics.docs docs``."""
+"""The table of metrics in docs/metrics.md, from the metrics themselves: ``python docs/scripts/metrics_page.py``."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from evaluators.metrics.table import METRICS
 
-PAGE = "metrics.md"
-BEGIN, END = "<!-- metrics: made by python -m evaluators.metrics.docs docs -->\n", "<!-- end of metrics -->\n"
+PAGE = Path(__file__).resolve().parents[1] / "metrics.md"
+BEGIN, END = "<!-- metrics: made by python docs/scripts/metrics_page.py -->\n", "<!-- end of metrics -->\n"
 HEAD = ("metric", "per step", "measured at", "unit", "better", "over a rollout", "accepted", "invalid")
 
 
@@ -23,12 +22,11 @@ def metric_table() -> str:
     return "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ("---",) * len(HEAD), *rows))
 
 
-def main(folder: Path) -> None:
-    """Rewrite the table between the marks of the page in a folder."""
-    text = (folder / PAGE).read_text(encoding="utf-8")
-    head, rest = text.split(BEGIN)
-    (folder / PAGE).write_text(head + BEGIN + metric_table() + END + rest.split(END)[1], encoding="utf-8")
+def main() -> None:
+    """Rewrite the table between the marks of the page."""
+    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    PAGE.write_text(head + BEGIN + metric_table() + END + rest.split(END)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()
