@@ -15,14 +15,14 @@ from alpasim_plugin.plugins.parts.resolve import declaration_of, note_of
 
 EPILOG = "Example: `simrun list scenarios`"
 
-Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators", "sources", "scenarios", "metrics"]
+Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators", "sources", "scenarios", "metrics", "presets"]
 
 
 def list_parts(
     kind: Annotated[Listed, Positional("What to list.")],
     as_json: Json = False,
 ) -> None:
-    """List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help."""
+    """List renderers, fixers, policies, other parts, shipped scenarios, metrics or presets, one a line with one line of help."""
     tables: dict[str, Callable[[], dict[str, str]]] = {
         "renderers": _renderers,
         "fixers": _fixers,
@@ -32,6 +32,7 @@ def list_parts(
         "sources": lambda: names("source"),
         "scenarios": _scenarios,
         "metrics": _metrics,
+        "presets": _presets,
     }
     known = tables[kind]()
     if as_json:
@@ -69,3 +70,9 @@ def _metrics() -> dict[str, str]:
     from evaluators.metrics.score import resolve_plugins
 
     return {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
+
+
+def _presets() -> dict[str, str]:
+    from evaluators.metrics.presets import described
+
+    return described()

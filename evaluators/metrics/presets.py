@@ -158,6 +158,26 @@ def contact_note(name: str) -> str:
     return f"contact at logged instants only: missed are {missed}; --preset {DEFAULT} looks between them too"
 
 
+HELP = {
+    "paper": "the closed-loop protocol of the OneFixer paper",
+    "strict": "ours, and the default: contact between steps, a signed margin to the edge of the road; needs a map",
+    "nuplan": "nuPlan's closed-loop score",
+    "navsim": "NAVSIM's PDM score and extended PDM score",
+    "hugsim": "HUGSIM's HD-Score",
+    "ncap": "NeuroNCAP's score",
+}
+
+
+def described() -> dict[str, str]:
+    """Return PRESET -> what it is, and what it does not see, the default first."""
+    order = sorted(PRESETS, key=lambda name: name != DEFAULT)
+    return {name: "; ".join(filter(None, (HELP.get(name) or PRESETS[name].reproduces, _unseen(name)))) for name in order}
+
+
+def _unseen(name: str) -> str:
+    return "" if PRESETS[name].protocol else contact_note(name)  # of benchmarks the contacts are those that they define
+
+
 def preset(name: str | Preset) -> Preset:
     """Return a preset by name; a `Preset` is passed through.
 
