@@ -15,7 +15,7 @@ from alpasim_plugin.io import places
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.one_policy import serve_policy
-    from alpasim_plugin.notebook.opening import open_run
+    from alpasim_plugin.notebook import open_run
     from alpasim_plugin.runtime.cell import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from policies import make_policy
@@ -62,7 +62,7 @@ __getattr__ = lazy_names(
         "load_scenario": "scenarios.load",
         "make_policy": "policies",
         "make_renderer": ".runtime.cell",
-        "open_run": ".notebook.opening",
+        "open_run": ".notebook",
         "run_rollout": ".runtime.rollout",
         "serve_policy": ".alpasim.server.one_policy",
     },

@@ -1,10 +1,17 @@
-"""Policies by name, and what policies share: the times of a plan, the camera to look through and its newest frame."""
+"""Policies by name, and what policies share: the times of a plan, the camera to look through and its newest frame, and the way from a path
+and a wish for speed to a plan that a car can drive.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
+import scipy
 
 from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import build, unidentified
@@ -78,3 +85,154 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
             "render the cameras that the policy names in `sensors`, at the scenario's size",
         )
     return frame
+
+
+MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
+MAX_LATERAL_MPS2 = 2.5  # comfort in curves
+MIN_LOOKAHEAD_M = 3.0
+CUT_M = 0.15
+LOOKAHEAD_S = 0.7
+SMOOTH_S = 0.8
+MAX_CURVATURE_1PM = 0.2  # turning radius 5 m
+MAX_PURSUIT_MPS2 = 4.0  # a target far to the side is met no harder than this
+
+
+@dataclass(frozen=True)
+class Path:
+    """A path in the rig frame, one point every ``SPACING_M``."""
+
+    SPACING_M = 1.0
+
+    xy: F64  # (N, 2) metres
+    curvature: F64  # (N,) 1/m, left positive
+
+
+def has_route(route_rig: F64) -> bool:
+    """Return whether at least half a metre of the route ``(20, 3)`` is left."""
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    return len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5
+
+
+def route_points(route_rig: F64) -> F64:
+    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where no route is left.
+
+    The route begins at the ego's projection, so the first point may lie beside the ego.
+    """
+    points = np.asarray(route_rig[np.isfinite(route_rig).all(axis=1), :2])
+    if has_route(route_rig):
+        return points
+    start = points[0] if len(points) else np.zeros(2)
+    return np.stack([start, start + np.array([1.0, 0.0])])
+
+
+def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
+    """Return the cubic spline through points ``(M, 2)``, at every ``spacing_m`` of chord length.
+
+    A route comes as points 4.2 m apart; on a bend of 10 m radius its polyline runs 0.2 m inside the road.
+    """
+    s = arc_lengths(points)
+    keep = np.concatenate([[True], np.diff(s) > 1e-6])
+    at = np.arange(0.0, max(float(s[-1]), spacing_m) + 1e-9, spacing_m)
+    if keep.sum() < 3:
+        return resample(points, at)
+    return np.asarray(scipy.interpolate.CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1])))
+
+
+def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> Path:
+    """Return a path through points ``(M, 2)``, resampled and extended straight to ``length_m``.
+
+    Its curvature is that of a heading averaged over what is driven in `SMOOTH_S`, at least 5 m: a coarse polyline has corners,
+    an estimate wobbles, and a car feels neither.
+
+    Args:
+        points: In driving order, at least two apart by more than a centimetre.
+        length_m: Shortest length of the result.
+        speed_mps: At which it will be driven.
+    """
+    s = arc_lengths(points)
+    tail = points[-1] - resample(points, [max(s[-1] - 5.0, 0.0)])[0]
+    tail = tail / max(float(np.hypot(*tail)), 1e-9)
+    missing = max(length_m - s[-1], 1.0)
+    line = np.concatenate([points, (points[-1] + missing * tail)[None]])
+    at = np.arange(0.0, s[-1] + missing, Path.SPACING_M)
+    xy = resample(line, at)
+    step = np.gradient(xy, Path.SPACING_M, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    half = round(max(5.0, SMOOTH_S * speed_mps) / Path.SPACING_M / 2)
+    kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
+    smooth = np.convolve(np.pad(heading, half, mode="edge"), kernel, mode="valid")
+    return Path(xy, np.gradient(smooth, Path.SPACING_M))
+
+
+def shifted(line: F64, left_m: float) -> F64:
+    """Return a line ``(M, 2)`` shifted to the left."""
+    step = np.gradient(line, axis=0)
+    normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
+    return np.asarray(line + left_m * normal)
+
+
+def curve_speeds(path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral_mps2: float = MAX_LATERAL_MPS2) -> F64:
+    """Return the speed limit ``(N,)`` along the path: comfort in curves, reached with a comfortable brake."""
+    curve = np.sqrt(lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-4))
+    limit = np.minimum(curve, cruise_mps)
+    # Backward pass: v_i^2 <= v_j^2 + 2 a (s_j - s_i) for every j > i.
+    reach = 2 * brake_mps2 * Path.SPACING_M * np.arange(len(limit))
+    squared = np.minimum.accumulate((limit**2 + reach)[::-1])[::-1] - reach
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
+
+def speed_profile(speed_mps: float, limits: F64, t_s: F64, accel_mps2: float = 1.5, brake_mps2: float = 4.0) -> F64:
+    """Return the progress ``(T,)`` at times ``(T,)`` of a car that nears the limits ``(N,)`` along its path within its comfort."""
+    progress, speed = np.zeros_like(t_s), speed_mps
+    ahead = limits.tolist()
+    for k in range(1, len(t_s)):
+        dt = float(t_s[k] - t_s[k - 1])
+        limit = ahead[min(int(progress[k - 1] / Path.SPACING_M), len(ahead) - 1)]
+        after = min(max(limit, speed - brake_mps2 * dt), speed + accel_mps2 * dt)
+        progress[k] = progress[k - 1] + 0.5 * (speed + after) * dt
+        speed = after
+    return progress
+
+
+def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
+    """Return positions ``(T, 2)`` and headings ``(T,)`` of a car that starts at the rig origin and pursues the path.
+
+    Pure pursuit (Coulter 1992, CMU-RI-TR-92-01): at each moment an arc to the path point one lookahead away. Each step of the roll-out is
+    an exact arc, so the plan starts at the car's pose and heading and can be driven.
+    """
+    lookahead = max(MIN_LOOKAHEAD_M, LOOKAHEAD_S * speed_mps)
+    # On an arc of curvature k the chord of a lookahead cuts the corner by lookahead^2 k / 8.
+    tightest = float(np.abs(path.curvature[: round(15.0 / Path.SPACING_M)]).max())
+    lookahead = min(lookahead, max((8 * CUT_M / max(tightest, 1e-6)) ** 0.5, MIN_LOOKAHEAD_M))
+    limit = min(MAX_CURVATURE_1PM, MAX_PURSUIT_MPS2 / max(speed_mps**2, 1.0))
+    xs, ys = path.xy[:, 0].tolist(), path.xy[:, 1].tolist()
+    x = y = yaw = 0.0
+    out = np.zeros((len(progress), 3))
+    nearest = 0
+    moves = np.diff(progress).tolist()
+    for k, ds in enumerate(moves):
+        nearest, target = _targets(xs, ys, x, y, nearest, lookahead)
+        dx, dy = xs[target] - x, ys[target] - y
+        left = -math.sin(yaw) * dx + math.cos(yaw) * dy
+        curvature = min(max(2 * left / max(dx * dx + dy * dy, 1e-6), -limit), limit)
+        half = 0.5 * curvature * ds
+        chord = ds * (math.sin(half) / half if abs(half) > 1e-8 else 1.0)
+        x += chord * math.cos(yaw + half)
+        y += chord * math.sin(yaw + half)
+        yaw += 2 * half
+        out[k + 1] = x, y, yaw
+    return out[:, :2].copy(), out[:, 2].copy()
+
+
+def _targets(xs: list[float], ys: list[float], x: float, y: float, start: int, lookahead: float) -> tuple[int, int]:
+    """Return the index of the nearest point from ``start`` on, and of the first later point at least ``lookahead`` away."""
+    nearest, best = start, float("inf")
+    for i in range(start, min(start + 8, len(xs))):
+        d = (xs[i] - x) ** 2 + (ys[i] - y) ** 2
+        if d < best:
+            nearest, best = i, d
+    limit = lookahead * lookahead
+    for i in range(nearest, len(xs)):
+        if (xs[i] - x) ** 2 + (ys[i] - y) ** 2 >= limit:
+            return nearest, i
+    return nearest, len(xs) - 1

@@ -12,11 +12,22 @@ from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Route, Scenario, SensorSpec
 from alpasim_plugin.plugins.interfaces import Policy
-from policies.base import camera_frame, front_camera, plan_times, seconds
+from policies.base import (
+    Path,
+    camera_frame,
+    curve_speeds,
+    follow,
+    front_camera,
+    has_route,
+    plan_times,
+    route_points,
+    seconds,
+    shifted,
+    smooth_line,
+)
 from policies.lane_filter import LaneState, predict, search, shift, update
 from policies.lane_plan import NOISE_SPEED, Blend, RoutePrior, blend, correlated_noise, idm_progress, route_prior, sample_sigma_m, sampled
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
-from policies.paths import Path, curve_speeds, follow, has_route, route_points, shifted, smooth_line
 from policies.road_vision import GroundGrid, PaintPoints, RidgeFilter, find_paint, make_grid
 
 NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it

@@ -8,9 +8,9 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64
+from policies.base import Path, make_path
 from policies.lane_filter import LaneState
 from policies.obstacle_vision import ObstacleTrack
-from policies.paths import Path, make_path
 
 ROUTE_SIGMA_M = 0.75  # how far a lane's centre may lie from the route, for all the policy knows
 SAME_LANE_M = 1.5

@@ -9,8 +9,7 @@ import numpy as np
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec
 from alpasim_plugin.plugins.interfaces import Policy
-from policies.base import plan_times, seconds
-from policies.paths import MIN_CRUISE_MPS, curve_speeds, follow, make_path, route_points, smooth_line, speed_profile
+from policies.base import MIN_CRUISE_MPS, curve_speeds, follow, make_path, plan_times, route_points, seconds, smooth_line, speed_profile
 
 
 class ConstantVelocity(Policy):

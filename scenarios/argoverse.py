@@ -20,8 +20,7 @@ from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, HeightFi
 from alpasim_plugin.io.reading.tables import Kind
 from alpasim_plugin.world.ground import from_points
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
-from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog, actors_of_track, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
 
 # Argoverse 2 mark types -> the paints a scene can show. Mixed lines take their solid half; double white is drawn as one line.
 PAINTS: dict[str, Paint] = {

@@ -23,8 +23,7 @@ from alpasim_plugin.io.limits import STEP, TIME_STEP_S
 from alpasim_plugin.world.ground import flat, from_points
 from scenarios.commonroad_map import number, point, read_lanelets
 from scenarios.map_lines import lane_edges, merge_areas, predecessors
-from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog, actors_of_track, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
 
 LABELS = {
     "car": "car",

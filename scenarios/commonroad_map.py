@@ -14,7 +14,7 @@ from alpasim_plugin.core.geometry import centre_line
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint, Signal
 from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 # Line markings of version 2020a; the format has no colour, so lines are white.
 PAINTS: dict[str, Paint] = {

@@ -21,8 +21,7 @@ from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, T
 from alpasim_plugin.world.ground import from_points
 from scenarios.cosmos_camera import FRONT_WIDE, front_camera, read_lenses
 from scenarios.map_lines import is_left_of, lane_edges
-from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,25 @@
-"""Cameras of a Cosmos-Drive-Dreams clip: f-theta lenses, and the pinhole inside the front wide one that is rendered."""
+"""Cameras of a Cosmos-Drive-Dreams clip and of an AlpaSim scene: f-theta lenses, and the pinhole that is rendered.
+
+What is written to the calibration table of an AlpaSim scene are the pinholes that are rendered, as the f-theta lenses that AlpaSim's
+renderers expect.
+"""
 
 from __future__ import annotations
 
+import io
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from alpasim_plugin.core.types import F64, CameraSpec, FTheta
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
+from scenarios.usdz_archive import Archive
 
 FRONT_WIDE = "camera_front_wide_120fov"
 WIDTH, HEIGHT = 512, 288  # rendered size; the recorded frames are 1920 x 1080
@@ -117,3 +128,132 @@ def orthonormal(transform: F64) -> F64:
     out = transform.copy()
     out[:3, :3] = u @ vt
     return out
+
+
+TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
+# Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
+FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...]]:
+    """Return the front wide camera where the scene holds its calibration, with notes.
+
+    Raises:
+        InputError: The table is there, but damaged or its front wide camera is not an f-theta camera.
+    """
+    member = next((name for name in TABLES if name in archive), None)
+    if member is None:
+        return (), ("no camera calibration in this scene: the default front camera is used",)
+    where = f"{archive.path}, {member}"
+    rows = archive.table(member)
+    try:
+        rig = archive.files.parse_json(str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where)
+        sensors = {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
+    except (IndexError, KeyError, TypeError) as error:
+        raise archive.files.fail(where, f"{type(error).__name__}: {error}", "give one row with rig_json") from error
+    sensor = sensors.get(FRONT_WIDE)
+    if sensor is None:
+        return (), (f"no {FRONT_WIDE} among {len(sensors)} calibrated sensors: the default front camera is used",)
+    try:
+        camera = front_camera(lens_of(_lens_numbers(sensor["properties"])), mount(sensor))
+    except (KeyError, TypeError, ValueError) as error:
+        raise archive.files.fail(f"{where}, {FRONT_WIDE}", f"{type(error).__name__}: {error}", "give an f-theta calibration") from error
+    return (camera,), ("rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",)
+
+
+def _lens_numbers(properties: dict[str, Any]) -> F64:
+    if properties.get("Model") != "ftheta":
+        raise ValueError(f"camera model {properties.get('Model')!r}")
+    coefficients = [float(v) for v in str(properties["polynomial"]).split()]
+    if not 1 <= len(coefficients) <= 6:
+        raise ValueError(f"a polynomial of {len(coefficients)} coefficients")
+    backward = str(properties.get("polynomial-type", "pixeldistance-to-angle")) == "pixeldistance-to-angle"
+    size = [float(properties[name]) for name in ("cx", "cy", "width", "height")]
+    return np.array([*size, *coefficients, *[0.0] * (6 - len(coefficients)), float(backward)])
+
+
+def mount(sensor: dict[str, Any]) -> F64:
+    """Return the ``(4, 4)`` pose of a camera in the rig: the nominal mount, turned and shifted by the estimated corrections."""
+    nominal = sensor["nominalSensor2Rig_FLU"]
+    turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
+    shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
+    out = np.eye(4)
+    out[:3, :3] = _rotation(nominal["roll-pitch-yaw"]) @ _rotation(turn) @ FLU_FROM_CAMERA
+    out[:3, 3] = np.asarray(nominal["t"], dtype=np.float64) + np.asarray(shift, dtype=np.float64)
+    return out
+
+
+def _rotation(roll_pitch_yaw_deg: Any) -> F64:
+    """Return Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cr, cp, cy), (sr, sp, sy) = (f(np.deg2rad(np.asarray(roll_pitch_yaw_deg, dtype=np.float64))) for f in (np.cos, np.sin))
+    x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(z @ y @ x)
+
+
+DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
+
+
+def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:
+    """Return ``calibration_estimate.parquet``: one row with the rig as JSON text.
+
+    Args:
+        cameras: By the logical id under which AlpaSim knows them.
+        clip_id: Names the clip.
+    """
+    sensors = [_sensor(name, camera) for name, camera in cameras.items()]
+    text = json.dumps({"rig": {"sensors": sensors}})
+    own = pa.struct([("rig_json", pa.string())])
+    schema = pa.schema([("key", pa.struct([("clip_id", pa.string())])), ("calibration_estimate", own)])
+    stream = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist([{"key": {"clip_id": clip_id}, "calibration_estimate": {"rig_json": text}}], schema=schema), stream)
+    return stream.getvalue()
+
+
+def pixel_to_angle(camera: CameraSpec) -> F64:
+    """Return coefficients ``(6,)`` of the angle (rad) as a polynomial of the distance (pixels) from the principal point.
+
+    A pinhole has theta = atan(r / f). Least squares over the image, with the constant zero; f is the mean of both focal lengths.
+    """
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]]) - camera.K[:2, 2]
+    reach = float(np.linalg.norm(corners, axis=1).max())
+    radius = np.linspace(0.0, 1.0, 1000)
+    powers = np.stack([radius**k for k in range(1, DEGREE + 1)], axis=1)
+    angle = np.arctan(radius * reach / float(np.mean(np.diag(camera.K)[:2])))
+    scaled = np.linalg.lstsq(powers, angle, rcond=None)[0]
+    return np.concatenate([[0.0], scaled / reach ** np.arange(1, DEGREE + 1)])
+
+
+def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
+    coefficients = " ".join(repr(float(c)) for c in pixel_to_angle(camera))
+    properties = {
+        "Model": "ftheta",
+        "width": str(camera.width),
+        "height": str(camera.height),
+        "cx": repr(float(camera.K[0, 2])),
+        "cy": repr(float(camera.K[1, 2])),
+        "polynomial": coefficients,
+        "polynomial-type": "pixeldistance-to-angle",
+        "linear-c": "1.0",
+        "linear-d": "0.0",
+        "linear-e": "0.0",
+    }
+    mount = {
+        "roll-pitch-yaw": _roll_pitch_yaw_deg(camera.T_rig_camera[:3, :3] @ FLU_FROM_CAMERA.T),
+        "t": camera.T_rig_camera[:3, 3].tolist(),
+    }
+    return {
+        "name": name.replace("camera_", "camera:", 1).replace("_", ":"),
+        "properties": properties,
+        "nominalSensor2Rig_FLU": mount,
+        "correction_sensor_R_FLU": {"roll-pitch-yaw": [0.0, 0.0, 0.0]},
+        "correction_rig_T": [0.0, 0.0, 0.0],
+    }
+
+
+def _roll_pitch_yaw_deg(rotation: F64) -> list[float]:
+    """Return the angles of Rz(yaw) Ry(pitch) Rx(roll) in degrees."""
+    pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    roll, yaw = np.arctan2(rotation[2, 1], rotation[2, 2]), np.arctan2(rotation[1, 0], rotation[0, 0])
+    return [float(angle) for angle in np.rad2deg([roll, pitch, yaw])]

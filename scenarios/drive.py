@@ -33,8 +33,7 @@ from alpasim_plugin.io.atomic import write_array, write_json
 from alpasim_plugin.io.reading import check_regular
 from alpasim_plugin.io.reading.arrays import open_npy
 from alpasim_plugin.io.reading.files import as_shape
-from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog, checked_trajectory, stands_still
+from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory, stands_still
 
 DRIVE_FILE, TRANSFORMS_FILE, GROUND_FILE, MODEL_FOLDER = "drive.json", "transforms.json", "ground.npy", "model"
 DOING = "reading an imported drive"

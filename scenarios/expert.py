@@ -29,7 +29,7 @@ from alpasim_plugin.world.idm import (
     spans,
 )
 from alpasim_plugin.world.path import Path
-from alpasim_plugin.world.scripted import track_on_path
+from scenarios.ego_path import track_on_path
 
 LOOKAHEAD_S = tuple(float(t) for t in np.arange(0.5, 4.01, 0.5))
 TIMES_S = np.array([0.0, *LOOKAHEAD_S])

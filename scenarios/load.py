@@ -12,6 +12,7 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import speeds
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -29,16 +30,15 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.io.reading import check_regular
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.plugins.parts.spec import digest
-from alpasim_plugin.world.ego import speeds
 from alpasim_plugin.world.paint import with_default_paint
 from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_scenario
 from scenarios.build import built_drive
-from scenarios.library import find
 from scenarios.map_lines import alpasim_view
 from scenarios.recorded import RecordedLog
 from scenarios.schema import CameraModel, VehicleSpec
 from scenarios.sources import open_document, recorded_drive, source_digest
+from scenarios.suite import find
 from scenarios.variation import Drawn, draw
 
 DOING = "reading a scenario"

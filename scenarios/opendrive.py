@@ -33,7 +33,7 @@ from scenarios.opendrive_road import (
     lane_key,
     reference_line,
 )
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 
 def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.io.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 Kind = Literal["line", "arc", "spiral", "poly3", "paramPoly3"]
 KINDS: tuple[Kind, ...] = ("line", "arc", "spiral", "poly3", "paramPoly3")

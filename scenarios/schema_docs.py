@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -27,7 +28,8 @@ PAGES = {  # page -> the sections of the schema whose tables it holds, by the fi
     "scenario-keys.md": (),
 }
 LIMITS_PAGE = "limits.md"
-WORDS = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+WORDS = {float: "number", int: "integer", str: "text", bool: "`true`, `false`"}
+HEAD = "| key | type | default | meaning |\n|---|---|---|---|"
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -38,18 +40,30 @@ def page_of(where: str) -> str:
 
 
 def key_tables(page: str) -> str:
-    """Return one Markdown table per section of a page."""
+    """Return one Markdown table per section of a page; what all kinds of a list have alike stands in a table before theirs."""
+    sections = {where: _rows(where, model) for where, model in models().items() if page_of(where) == page}
     out = []
-    for where, model in models().items():
-        if page_of(where) != page:
-            continue
-        summary = (model.__doc__ or "").strip().split("\n")[0]
-        out.append(f"### {f'`{where}`' if where else 'Top level'}\n\n{summary}\n\n| key | type | default | meaning |\n|---|---|---|---|")
-        discriminator = "kind" if " kind: " in where else ""  # the heading says it
-        fields = ((name, field) for name, field in model.model_fields.items() if name != discriminator)
-        out += [f"| `{name}` | {_kind(field)} | {_default(field)} | {field.description} |" for name, field in fields]
-        out.append("")
+    for where, rows in sections.items():
+        owner, _, kind = where.partition(" kind: ")
+        kinds = [set(sections[name]) for name in sections if kind and name.startswith(f"{owner} kind: ")]
+        in_most = {row for row in rows if sum(row in of_kind for of_kind in kinds) > len(kinds) / 2}
+        names = set.intersection(*({_key(row) for row in of_kind} for of_kind in kinds)) if kinds else set()
+        alike = [row for row in rows if row in in_most and _key(row) in names]
+        if alike and f"### `{owner}`\n" not in out:
+            out += [f"### `{owner}`\n", "Keys of every kind; a kind's own table says what differs.\n", HEAD, *alike, ""]
+        summary = (models()[where].__doc__ or "").strip().split("\n")[0]
+        out += [f"### {f'`{where}`' if where else 'Top level'}\n", f"{summary}\n", HEAD, *(row for row in rows if row not in alike), ""]
     return "\n".join(out) + "\n"
+
+
+def _rows(where: str, model: type[BaseModel]) -> list[str]:
+    discriminator = "kind" if " kind: " in where else ""  # the heading says it
+    fields = ((name, field) for name, field in model.model_fields.items() if name != discriminator)
+    return [f"| `{name}` | {_kind(field)} | {_default(field)} | {field.description} |" for name, field in fields]
+
+
+def _key(row: str) -> str:
+    return row.split(" | ", maxsplit=1)[0]
 
 
 def limit_tables() -> str:
@@ -59,22 +73,22 @@ def limit_tables() -> str:
 
 
 def _limits(rows: Sequence[Bound]) -> str:
-    lines = ["| quantity | unit | least | most | why |", "|---|---|---:|---:|---|"]
-    lines += [f"| {row.name} | {row.unit} | {number(row.low)} | {number(row.high)} | {row.reason} |" for row in rows]
+    lines = ["| quantity | least | most |", "|---|---:|---:|"]
+    lines += [f"| {row.name}{f' ({row.unit})' if row.unit else ''} | {number(row.low)} | {number(row.high)} |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
 def _kind(field: FieldInfo) -> str:
-    texts = [_name(field.annotation)]
-    for item in field.metadata:
-        texts += [f"{sign} {getattr(item, name)}" for name, sign in SIGNS.items() if getattr(item, name, None) is not None]
-    return ", ".join(texts)
+    bound = {name: getattr(item, name) for item in field.metadata for name in SIGNS if getattr(item, name, None) is not None}
+    if {"ge", "le"} <= bound.keys():
+        return f"{_name(field.annotation)}, {bound['ge']}..{bound['le']}"
+    return ", ".join([_name(field.annotation), *(f"{SIGNS[name]} {value}" for name, value in bound.items())])
 
 
 def _name(annotation: Any) -> str:
     origin, options = get_origin(annotation), get_args(annotation)
     if origin is Literal:
-        return " \\| ".join(f"`{a}`" for a in options)
+        return ", ".join(f"`{a}`" for a in options)
     if hasattr(annotation, "__metadata__"):
         return _name(options[0])
     if origin is dict:
@@ -97,6 +111,8 @@ def _default(field: FieldInfo) -> str:
         return "none"
     if isinstance(value, Part):
         return "see below"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
     if isinstance(value, tuple):
         return f"`[{', '.join(map(str, value))}]`"
     return f"`{value}`" if value not in ("", {}) else "empty"

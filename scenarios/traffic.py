@@ -12,17 +12,18 @@ from alpasim_plugin.core.types import F64, I64, Actor, Behaviour, Box, Trajector
 from alpasim_plugin.world.idm import IdmParams
 from alpasim_plugin.world.path import Path, polyline_path
 from alpasim_plugin.world.roads import Road, polyline
-from alpasim_plugin.world.scripted import (
+from scenarios.ego_path import (
+    EgoPath,
     brake_rows,
     cut_in_track,
     grid,
     integrate,
+    lane_chain,
     speed_profile,
     standing_track,
     track_on_path,
     walk_track,
 )  # fmt: skip
-from scenarios.ego_path import EgoPath, lane_chain
 from scenarios.expert import Drive, ExpertStyle, Follower, drive
 from scenarios.schema import EgoSpec, ScenarioSpec
 from scenarios.schema_parts import (

@@ -16,15 +16,13 @@ import numpy as np
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.types import F64, Actor, Box, LaneMap, Scene, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
-from scenarios.cosmos_camera import FRONT_WIDE
+from scenarios.cosmos_camera import FRONT_WIDE, front_wide
 from scenarios.map_lines import lane_edges
 from scenarios.opendrive import T_local_map, lane_map_of
 from scenarios.opendrive_alpasim import alpasim_map
 from scenarios.opendrive_road import parse_map
-from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 from scenarios.usdz_archive import Archive
-from scenarios.usdz_camera import front_wide
 from scenarios.usdz_tables import clipgt_map, without_rails
 
 DOING = "reading an AlpaSim scene"

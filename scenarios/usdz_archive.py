@@ -10,11 +10,10 @@ from typing import Any
 
 from alpasim_plugin.io.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.files import open_regular
-from alpasim_plugin.io.reading.packed import check_names
+from alpasim_plugin.io.reading.files import check_names, open_regular
 from alpasim_plugin.io.reading.tables import parse_parquet
 from alpasim_plugin.io.yaml_positions import parse
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 
 class Archive:

@@ -21,7 +21,7 @@ import shapely
 
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.map_lines import NO_LANES_OF_CARS, predecessors, rails, with_vertices
-from scenarios.reading import MAX_REACH_M
+from scenarios.recorded import MAX_REACH_M
 from scenarios.usdz_archive import Archive
 
 FOLDERS = ("map_data", "clipgt", "fastmap")  # the first usable one counts

@@ -22,8 +22,7 @@ from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import F64, Actor, CameraSpec, HeightField, Scenario, Trajectory, Vehicle
 from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.world.ground import height_at
-from scenarios.cosmos_camera import FRONT_WIDE
-from scenarios.usdz_camera import calibration_table
+from scenarios.cosmos_camera import FRONT_WIDE, calibration_table
 from scenarios.usdz_tables import map_tables
 
 DOING = "writing an AlpaSim scene"

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         SensorSpec,
         Trajectory,
     )
-    from alpasim_plugin.notebook.opening import open_run
+    from alpasim_plugin.notebook import open_run
     from alpasim_plugin.runtime.cell import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from evaluators import aggregate, paired, reduce_rollout, resolve_evaluators, rollout_values, score, series
@@ -42,7 +42,7 @@ HOMES = {
         "CameraSpec", "EgoState", "Frame", "MetricInfo", "MetricSeries", "Observation", "Plan", "RenderRequest", "RolloutLog", "Route",
         "Scenario", "Scene", "SensorSpec", "Trajectory", "U8",
     ],
-    "alpasim_plugin.notebook.opening": ["open_run"],
+    "alpasim_plugin.notebook": ["open_run"],
     "alpasim_plugin.runtime.cell": ["make_renderer"],
     "alpasim_plugin.runtime.rollout": ["run_rollout"],
     "evaluators": ["aggregate", "paired", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series"],

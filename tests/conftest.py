@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.durations import pytest_addoption, pytest_runtest_logreport, pytest_terminal_summary  # noqa: F401 - hooks
+from tests.durations import kept_seconds, pytest_addoption, pytest_runtest_logreport, pytest_terminal_summary  # noqa: F401 - hooks
 from tests.examples import PROFILE, examples
 from tests.report.browser import Browser, find_chromium
 
@@ -40,22 +40,23 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 # A kernel's first call compiles it, for half a minute, and leaves it on disk for every later process. The files that compile the three
-# groups of kernels come first, one a worker, so that no two processes compile the same ones; then what takes longest, so that no worker is
-# left alone with it at the end.
-FIRST = ("gaussians/test_rasterize_hard_cases.py", "semantic_map/test_draw.py", "gaussians/test_rasterize_gradient.py")
-LONG = ("plugins", "alpasim", "runtime", "gaussians", "training", "cli", "renderers", "fixers", "bench")
-
-
-def order_of(item: pytest.Item) -> int:
-    """Return when the file of a test is due: smaller is earlier."""
-    folder, file = item.path.parent.name, item.path.name
-    if f"{folder}/{file}" in FIRST:
-        return FIRST.index(f"{folder}/{file}")
-    return len(FIRST) + (LONG.index(folder) if folder in LONG else len(LONG))
+# groups of kernels come first, one a worker, so that no two processes compile the same ones; then what took longest when it was last
+# measured, so that no worker is left alone with it at the end.
+FIRST = (
+    "tests/gaussians/test_rasterize_hard_cases.py",
+    "tests/semantic_map/test_draw.py",
+    "tests/gaussians/test_gradient_gsplat.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the files in the order in which workers take them."""
+    took_s = kept_seconds()
+
+    def order_of(item: pytest.Item) -> tuple[int, float]:
+        file = item.nodeid.partition("::")[0]
+        return (FIRST.index(file) if file in FIRST else len(FIRST)), -took_s.get(file, 0.0)
+
     items.sort(key=order_of)
 
 

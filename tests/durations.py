@@ -28,6 +28,11 @@ def slower(before: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
     return [line for _, line in sorted(worse)]
 
 
+def kept_seconds() -> dict[str, float]:
+    """Return the seconds of each file as they were kept; none where nothing is."""
+    return json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--durations-file", type=Path, help="write the seconds that each file of tests took here, and compare them")
 
@@ -40,7 +45,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     file: Path | None = config.getoption("--durations-file")
     if file is None:
         return
-    before = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+    before = kept_seconds()
     now = {name: round(took, 1) for name, took in sorted(seconds.items())}
     file.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
     terminalreporter.section("files that became slower")

@@ -20,8 +20,7 @@ from alpasim_plugin.recordings.rerun_file import require_rerun, write_rrd
 from alpasim_plugin.run_folder.schema import CONTENTS
 from alpasim_plugin.runtime.export import Export, export_run, export_scenes
 from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted
-from alpasim_plugin.viewer.page_data import read_logs
+from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, read_logs
 from evaluators.opening import read_so_far
 
 DOING = "exporting"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
-from alpasim_plugin.core.installed import installed_names
+from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.io import places
 from alpasim_plugin.process.signals import Stopped, leave_at_once, stoppable
 
@@ -34,15 +34,15 @@ GROUPS: dict[str, dict[str, str]] = {
     "Bring in": {"import": "import_drive:app"},
     "Drive": {"run": "run:run", "decide": "decide:decide", "fork": "fork:fork", "probe": "fork:probe", "refine": "refine:refine"},
     "Read results": {
-        "score": "score:score", "compare": "compare:compare", "aggregate": "aggregate:aggregate", "gate": "gate:gate",
-        "report": "report:report", "runs": "runs:runs",
+        "score": "score:score", "compare": "compare:compare", "aggregate": "compare:aggregate", "gate": "gate:gate",
+        "report": "view:report", "runs": "runs:runs",
     },
-    "Look": {"why": "why:why", "view": "view:view", "preview": "preview:preview"},
+    "Look": {"why": "fork:why", "view": "view:view", "preview": "preview:preview"},
     "AlpaSim": {
-        "serve": "serve:serve", "serve-policy": "serve_policy:serve_policy", "check-driver": "check_driver:check_driver",
+        "serve": "serve:serve", "serve-policy": "serve:serve_policy", "check-driver": "check_policy:check_driver",
         "export": "export:export",
     },
-    "Extend": {"list": "listing:list_parts", "new": "new:new", "check-policy": "check_policy:check_policy"},
+    "Extend": {"list": "new:list_parts", "new": "new:new", "check-policy": "check_policy:check_policy"},
     "Check and read": {"check": "check:check", "doctor": "doctor:doctor", "docs": "docs:docs"},
 }  # fmt: skip
 PLUGINS = "From installed packages"

@@ -56,9 +56,6 @@ class What:
     overrides: Annotated[
         tuple[str, ...], Flag("Override a scenario key, key=value, or with [RENDERER:]fixer. a fixer's. Repeatable.", "--set")
     ] = ()
-    timeline: Annotated[
-        Literal["scenario", "alpasim"], Flag("alpasim: start at the first recorded frame and force 1.7 s, as AlpaSim does.")
-    ] = "scenario"
     source: Annotated[str | None, Flag("Reader of the recorded log: a name, or package.module:Class.", names="source")] = None
 
     @property
@@ -76,8 +73,7 @@ class What:
     @property
     def of_scene(self) -> tuple[str, ...]:
         """Give the overrides of scenarios."""
-        of_scene, _ = split_overrides(self.overrides)
-        return of_scene if self.timeline == "scenario" else (*of_scene, f"timing.timeline={self.timeline}")
+        return split_overrides(self.overrides)[0]
 
 
 @dataclass(frozen=True)
@@ -85,22 +81,21 @@ class Where:
     """Where rollouts run and where they are kept."""
 
     workers: Workers = None
-    executor: Annotated[str, Flag("Where rollouts run: `local`, `ray`, `ray:HOST:PORT`, `slurm` or `slurm:PARTITION`.")] = "local"
-    cores: Annotated[int | None, Flag("Cores of each worker on a cluster; by default 1.", min=1)] = None
-    gpus: Annotated[float | None, Flag("Share of a GPU of each worker on a cluster.", min=0.0)] = None
-    memory: Annotated[float | None, Flag("Memory of each worker on a cluster, in GiB.", min=0.001)] = None
+    executor: Annotated[
+        str,
+        Flag("`local`, `ray[:HOST:PORT]` or `slurm[:PARTITION]`; behind it what a worker needs: `ray?cores=2&gpus=0.5&memory=8` (GiB)."),
+    ] = "local"
     store: Annotated[str | None, Flag("Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.", metavar="URL")] = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the same meaning of `execute_run` and `execute_decision`.
 
         Raises:
-            InputError: There is no such executor, or ``local`` is given resources.
+            InputError: There is no such executor, or it cannot be given what a worker needs.
         """
         from alpasim_plugin.runtime.executors.choice import parse_executor
 
-        executor = parse_executor(self.executor, self.cores, self.gpus, self.memory)
-        return {"workers": self.workers, "executor": executor, "store": self.store}
+        return {"workers": self.workers, "executor": parse_executor(self.executor), "store": self.store}
 
 
 @dataclass(frozen=True)
@@ -210,7 +205,7 @@ def _names(kind: str) -> Callable[[str], list[str]]:
     def offer(incomplete: str) -> list[str]:
         from alpasim_plugin.plugins.parts import names
         from evaluators import PRESETS
-        from scenarios.library import shipped_names, suites
+        from scenarios.suite import shipped_names, suites
 
         before, comma, last = incomplete.rpartition(",")
         known = {"preset": lambda: [*PRESETS], "scenario": lambda: [*shipped_names(), *suites()]}

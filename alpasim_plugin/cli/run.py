@@ -29,8 +29,7 @@ from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 from evaluators.statistics.arms import arms_of, base_named
-from scenarios.library import shipped_names
-from scenarios.suite import expand
+from scenarios.suite import expand, shipped_names
 
 TRACEBACK_LINES = 4  # of a failure, in the terminal
 
@@ -45,7 +44,7 @@ Examples:
 
 - `simrun --renderer clean --policy log-replay ../data/av2/7fab2350`
 
-- `simrun --renderer clean,3dgs --executor ray --cores 2 suites/urban`
+- `simrun --renderer clean,3dgs --executor 'ray?cores=2' suites/urban`
 
 - `simrun --renderer clean,3dgs --executor slurm:cpu --workers 64 --store s3://bucket/night suites/urban`
 """

@@ -1,4 +1,4 @@
-"""``simrun view``: replay rollouts in a browser."""
+"""``simrun view``: replay rollouts in a browser. ``simrun report``: write a run's report again from its tables."""
 
 from __future__ import annotations
 
@@ -7,24 +7,30 @@ import shlex
 from pathlib import Path
 from typing import Annotated
 
-from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing
+from rich.console import Console
+
+from alpasim_plugin.cli.options import Json, Overwrite, Run, refuse_existing
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.run_folder.manifests import read_manifest
-from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO
+from alpasim_plugin.run_folder.manifests import read_manifest, read_run_json
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO, SUMMARY
 from alpasim_plugin.runtime.repair import use_run
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options, write_page
 from alpasim_plugin.viewer.pictures import Fineness
 from alpasim_plugin.viewer.serve import RunServer, loopback
+from evaluators.metrics import MetricTable
 from evaluators.opening import read_so_far
+from evaluators.report import render_table
 
 DOING = "watching rollouts"
 PAGE = "view.html"
 
-EPILOG = """
+VIEW_EPILOG = """
 Examples:
 
 - `simrun view runs/us101`: runs/us101/view.html, an offline page with changed outcomes and events first
@@ -48,14 +54,13 @@ def view(
     cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
     width: Annotated[int, Flag("Frames wider than this are made smaller, pixels.", min=64, max=4096)] = 512,
-    every: Annotated[int, Flag("Keep every n-th camera frame.", min=1)] = 1,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run."""
     root, of_rollout = find_cell(what, DOING)
     wanted = narrowed(what, of_rollout, asked, DOING)
-    options = Options(int(max_mb * MB), Fineness(every, width), camera)
+    options = Options(int(max_mb * MB), Fineness(width_px=width), camera)
     if serve is not None:
         if out is not None:
             raise InputError(DOING, "--serve and --out", "both", "give one of them")
@@ -124,3 +129,21 @@ def narrowed(what: Path, rollout: Wanted | None, asked: Wanted, doing: str) -> W
     if asked.scenes or asked.policies or asked.seeds:
         raise InputError(doing, str(what), "--scene, --policy or --seed beside a rollout, which has one of each", "name its run folder")
     return Wanted(rollout.scenes, rollout.policies, rollout.seeds, asked.renderers)
+
+
+REPORT_EPILOG = "Example: `simrun report runs/us101`"
+
+
+def report(
+    run: Run,
+    as_json: Json = False,
+) -> None:
+    """Write report.html, summary.md and junit.xml of a run again and print its table."""
+    use_run(run, warn)
+    summary = read_json(run / SUMMARY)
+    page = write_reports(run, flips=read_run_json(run).get("kind") != "score")
+    if as_json:
+        print(json.dumps({"report": str(page), "summary": summary}))
+    else:
+        Console().print(render_table(summary, known=MetricTable.of_run(read_run_json(run))))
+        print(f"report   {page}")

@@ -1,9 +1,16 @@
-"""Imported on first use: public names of a package, so that naming one does not load all, and libraries that only one feature needs."""
+"""What is imported on demand: public names of a package, libraries that only one feature needs, and what installed packages register.
+
+The working directory is no installed package, whatever it holds.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from importlib import import_module
+from importlib.metadata import EntryPoint, distributions
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
@@ -39,3 +46,57 @@ def require_library(module: str, doing: str, with_what: str, do_this: str) -> An
         return import_module(module)
     except ImportError as error:
         raise InputError(doing, with_what, f"the library {module.partition('.')[0]} cannot be imported: {error}", do_this) from error
+
+
+def installed(group: str) -> Mapping[str, EntryPoint]:
+    """Return what the installed packages register in a group of entry points, by name; nothing of theirs is imported.
+
+    A folder that was received from somebody may hold a distribution's metadata, which make no installed package.
+    """
+    return {point.name: point for point in _points(group, _search_path())}
+
+
+def installed_names(group: str, taken: Mapping[str, str], what: str) -> dict[str, str]:
+    """Return what installed packages register in a group: name to ``package.module:attribute``. Nothing of theirs is imported.
+
+    Args:
+        group: Entry-point group, ``simrun.policies``.
+        taken: Names that are taken, with the target of each; the same target may be given again.
+        what: What is registered, for the error: ``policy``.
+
+    Raises:
+        InputError: Two packages claim one name.
+    """
+    found: dict[str, str] = {}
+    for point in _points(group, _search_path()):
+        other = found.get(point.name, taken.get(point.name))
+        if other is not None and other != point.value:
+            raise InputError(
+                f"loading {what} plugins",
+                f"entry point {point.name!r} = {point.value!r}",
+                f"the name is taken by {other}",
+                "uninstall one of the two packages or rename its entry point",
+            )
+        found[point.name] = point.value
+    return found
+
+
+def _search_path() -> tuple[str, ...]:
+    here = os.path.realpath(os.getcwd())
+    return tuple(folder for folder in sys.path if folder and os.path.realpath(folder) != here)
+
+
+@lru_cache(maxsize=64)
+def _points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Return the entry points of a group; of two distributions of one name the first on the path counts.
+
+    Scanning the installed packages takes tens of milliseconds and changes only with the import path.
+    """
+    seen = set[str]()
+    found: list[EntryPoint] = []
+    for one in distributions(path=list(path)):
+        points = one.entry_points.select(group=group)
+        if points and one.name not in seen:  # the name takes long to read
+            seen.add(one.name)
+            found += points
+    return tuple(found)

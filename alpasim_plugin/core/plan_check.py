@@ -1,4 +1,7 @@
-"""What is wrong with a plan or with sensors, in a sentence. A policy may return anything; nothing here assumes more than an object."""
+"""What policies of others are met with: what is wrong with a plan or with sensors, in a sentence, and a scenario that says nothing.
+
+A policy may return anything; nothing here assumes more than an object.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.types import SensorSpec
+from alpasim_plugin.core.types import (
+    CameraSpec,
+    Degradation,
+    Environment,
+    HeightField,
+    LaneMap,
+    Latency,
+    Rates,
+    Route,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+    Vehicle,
+)
 
 ARRAYS = ("times_us", "xy", "yaw")
 UNITS = ((100.0, "centimetres"), (1000.0, "millimetres"), (0.001, "kilometres"), (3.28, "feet"), (3.6, "km/h taken for m/s"))
@@ -85,3 +101,32 @@ def _samples_problem(samples: Any, n: int) -> str:
 
 def _a(value: Any) -> str:
     return "nothing" if value is None else f"a {type(value).__name__}"
+
+
+def blank_scenario(scene_id: str, ego_log: Trajectory, cameras: Sequence[CameraSpec] = ()) -> Scenario:
+    """Return a scenario with a flat ground, an empty map and no actors; all of the drive is the rollout.
+
+    Args:
+        scene_id: Its id.
+        ego_log: Recorded rig poses, world.
+        cameras: Its cameras.
+    """
+    return Scenario(
+        scene_id=scene_id,
+        source="yaml",
+        seed=0,
+        lane_map=LaneMap({}),
+        ground=HeightField(0.0, 0.0, 1.0, np.zeros((2, 2))),
+        ego_log=ego_log,
+        vehicle=Vehicle(),
+        route=Route(ego_log.xyz),
+        actors=(),
+        cameras=tuple(cameras),
+        rates=Rates(),
+        start_us=int(ego_log.t_us[0]),
+        end_us=int(ego_log.t_us[-1]),
+        warmup_us=0,
+        latency=Latency(),
+        environment=Environment(),
+        degradation=Degradation(),
+    )

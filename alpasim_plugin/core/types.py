@@ -140,6 +140,10 @@ class RenderRequest:
     ahead: Sequence[RenderRequest] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
 
 
+# Facts of a frame that a fixer made of recorded ones: shares of the picture, 0 to 1, and both by cell (`fixers.trust`).
+RECORDED_SHARE, GUESSED_SHARE, TRUST_CELLS = "recorded_share", "guessed_share", "trust_cells"
+
+
 @dataclass(frozen=True)
 class Frame:
     """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote, video)."""
@@ -150,7 +154,7 @@ class Frame:
     alpha: F32 | None = None  # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
     depth: F32 | None = None  # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
-    facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
+    facts: Mapping[str, float | str] = field(default_factory=dict)  # about this frame, for the log, such as "pose_error_m"
     references: tuple[U8, ...] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
 
 

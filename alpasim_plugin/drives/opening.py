@@ -10,10 +10,9 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.colmap import model_folder, read_colmap
 from alpasim_plugin.drives.dgp import is_dgp, read_dgp
-from alpasim_plugin.drives.frames import Report
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
-from alpasim_plugin.drives.sfm import is_unposed, read_unposed
+from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
 from alpasim_plugin.gaussians.sh import C0

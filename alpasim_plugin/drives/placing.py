@@ -17,7 +17,7 @@ from alpasim_plugin.drives.source import DOING, Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
 AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car

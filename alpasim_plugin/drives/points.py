@@ -19,10 +19,9 @@ from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.drives.ground import GroundStrip
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit.adjust import corrected
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.start import matches
-from alpasim_plugin.gaussians.fit.tracks import Tracks, follow, place, pose_arrays, residuals
+from alpasim_plugin.gaussians.fit.tracks import Tracks, corrected, follow, place, pose_arrays, residuals
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 WIDTH_PX = 1280  # following and matching need no more

@@ -16,7 +16,7 @@ from alpasim_plugin.core.types import F32, F64, U8
 from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
-from alpasim_plugin.gaussians.fit.balance import gain_between
+from alpasim_plugin.gaussians.fit.lens import gain_between
 from alpasim_plugin.gaussians.fit.quality import Comparison
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.settings import WeightedSettings
 from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.io.reading.arrays import read_metadata
 from alpasim_plugin.io.reading.files import kind_of, parse_json
-from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.plugins.interfaces import Declaration, Fixer
 
 if TYPE_CHECKING:

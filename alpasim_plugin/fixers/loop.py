@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
-from alpasim_plugin.core.installed import installed
+from alpasim_plugin.core.lazy import installed
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.settings import FixerSettings

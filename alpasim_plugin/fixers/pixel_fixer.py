@@ -21,16 +21,12 @@ from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.trust import trust
 from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
 from alpasim_plugin.nets.machine_probe import take_threads
-from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
-from alpasim_plugin.nets.pixel_source import content_key, pixel_noise, sparse_source
+from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState, content_key, pixel_noise, sparse_source
 from alpasim_plugin.nets.schedule import from_names, interpolant
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
-
-# Facts of a frame, 0 to 1: how much of the picture its references are, and how much the generator itself has made up.
-RECORDED, GUESSED = "recorded_share", "guessed_share"
-MADE_UP = 0.25  # a pixel that differs from the render by so much, of a range of 2, is the generator's own altogether
 
 
 @dataclass(frozen=True)
@@ -169,8 +165,10 @@ class PixelFixer(Fixer):
         for view in views:
             for camera, index, made, event in self._fix(view, pasts):
                 frame = replace(block[index[0]], references=())
-                frame = replace(frame, facts={**frame.facts, **trust(made.state)})
-                out[index[0]] = replace(frame, events=(*frame.events, event)) if event else replace(frame, rgb=made.fixed)
+                if event:  # the render is returned, and nothing of the network's
+                    out[index[0]] = replace(frame, events=(*frame.events, event))
+                else:
+                    out[index[0]] = replace(frame, rgb=made.fixed, facts={**frame.facts, **_trust(made)})
                 after[camera] = made
         return tuple(out), after
 
@@ -209,15 +207,12 @@ class PixelFixer(Fixer):
         return found
 
 
-def trust(state: PixelState) -> dict[str, float]:
-    """Return where the last output comes from, as facts of its frame."""
-    own = (state.output - state.render).abs_().mean(dim=-1, keepdim=True).mul_(1 / MADE_UP).clamp_(max=1)
-    return {RECORDED: _mean(state.recorded), GUESSED: _mean(own * (1 - state.recorded))}
-
-
-def _mean(values: Tensor) -> float:
-    """Return the mean on one thread: torch's depends in its last bits on the number of threads, and facts must not."""
-    return float(values.cpu().float().numpy().mean(dtype=np.float64))
+def _trust(made: CameraHistory) -> dict[str, float | str]:
+    """Return where a camera's last picture comes from, without the padding below and to the right of it."""
+    height, width = made.fixed.shape[:2]
+    parts = (made.state.output, made.state.render, made.state.recorded)
+    output, render, recorded = (part[0, :height, :width].cpu().float().numpy() for part in parts)
+    return trust(output, render, recorded[..., 0])
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:

@@ -1,4 +1,4 @@
-"""A random scene with the statistics of a street and a camera in it, for tests and measurements of the rasterisers."""
+"""A random scene with the statistics of a street, for tests and measurements of the rasterisers, and tiny cases that compile kernels."""
 
 from __future__ import annotations
 
@@ -81,3 +81,34 @@ def driving_camera(width: int, height: int, yaw_rad: float = 0.0) -> PinholeCame
     T_world_camera[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T_world_camera[:3, 3] = [0, 0, 1.6]
     return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)
+
+
+SIDE_PX = 16
+
+
+def rasterise() -> None:
+    """Draw one Gaussian."""
+    from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_cpu
+
+    rasterize_cpu(_cloud(), _camera(), np.zeros((SIDE_PX, SIDE_PX, 3), np.float32), threads=1)
+
+
+def fit() -> None:
+    """Take the gradient of one Gaussian's image."""
+    # Imported on use: it loads torch.
+    from alpasim_plugin.gaussians.raster.gradient_types import Splats
+    from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+
+    splats = Splats.from_cloud(_cloud())
+    splats.means.requires_grad_(True)
+    loss = rasterize_gradient(splats, _camera(), threads=1).rgb.sum()
+    loss.backward()  # type: ignore[no-untyped-call]
+
+
+def _cloud() -> GaussianCloud:
+    parts = [[0, 0, 5]], [[1, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], [[[0.1, 0.2, 0.3]]]
+    return GaussianCloud(*(np.array(part, np.float32) for part in parts))
+
+
+def _camera() -> PinholeCamera:
+    return PinholeCamera.from_hfov(SIDE_PX, SIDE_PX, 1.0)

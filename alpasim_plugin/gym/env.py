@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 
 from alpasim_plugin.control import make_controller
-from alpasim_plugin.control.base import check_interval, planar, spatial
 from alpasim_plugin.control.bicycle import Command, step
+from alpasim_plugin.control.tracker import check_interval, planar, spatial
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.plan_check import plan_problem
 from alpasim_plugin.core.seeding import derive_seed

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from alpasim_plugin.core.installed import installed
+from alpasim_plugin.core.lazy import installed
 
 GROUP = "simrun.networks"
 __all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"]

@@ -2,7 +2,7 @@
 
 Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor multiplies matrices of it, about as
 fast where it only converts, and several times slower where it is emulated; and a second thread that shares a core may cost more than it
-brings. Within a run each node is asked once, for all of its workers (`alpasim_plugin.io.measured`).
+brings. Within a run each node is asked once, for all of its workers (`alpasim_plugin.io.cache`).
 
 Where a fixer computes.
 """
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import FixerError
-from alpasim_plugin.io.measured import measured
+from alpasim_plugin.io.cache import measured
 
 REPEATS = 5
 LONG_ENOUGH_S = 0.1  # no further turn after this: what takes so long has lost

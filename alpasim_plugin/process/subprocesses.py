@@ -1,9 +1,15 @@
-"""Child processes: workers of our own, and a command of the user's, whose output is passed on. None outlives this process."""
+"""Child processes: workers of our own, and a command of the user's, whose output is passed on. None outlives this process.
+
+Standard output belongs to the command: what parts print goes to standard error, so that ``--json`` stays one document. In a run it also
+goes to a file beside the rollout's log.
+"""
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
+import io
 import multiprocessing
 import os
 import signal
@@ -16,6 +22,7 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
+from typing import TextIO
 
 from alpasim_plugin.core.errors import InputError
 
@@ -185,3 +192,61 @@ def exit_reason(code: int) -> str:
     """
     names = {128 + int(one): one.name for one in signal.Signals}
     return f"exit code {code}" + (f" ({names[code]})" if code in names else "")
+
+
+MOST_BYTES = 4 << 20  # of the file; a part that prints without end does not fill the disk
+_LEFT_OUT = "\n(the rest is left out)\n"
+_open: list[_Output] = []
+
+
+class _Output(io.TextIOBase):
+    """Standard error, and a file that is made when there is something to write."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path, self._written = path, 0
+        self._file: TextIO | None = None
+        self._lock = threading.Lock()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        """Write to both; several threads may."""
+        sys.stderr.write(text)
+        with self._lock:
+            if self._path is not None and self._written < MOST_BYTES:
+                if self._file is None:
+                    self._file = self._path.open("w", encoding="utf-8", errors="replace")
+                self._written += len(text)
+                self._file.write(text if self._written < MOST_BYTES else _LEFT_OUT)
+                self._file.flush()
+        return len(text)
+
+    def flush(self) -> None:
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        """Close the file; later text goes to standard error alone."""
+        with self._lock:
+            self._path = None
+            if self._file is not None:
+                self._file.close()
+
+
+@contextmanager
+def parts_print_to_stderr(file: Path | None = None) -> Iterator[None]:
+    """Send what is printed during the block to standard error, and to ``file``, which is made only if something is printed."""
+    output = _Output(file)
+    _open.append(output)
+    try:
+        with contextlib.redirect_stdout(output):
+            yield
+    finally:
+        _open.remove(output)
+        output.end()
+
+
+def say(line: str) -> None:
+    """Pass on a line that a part in another process printed; any thread may call it."""
+    output = _open[-1] if _open else sys.stderr
+    output.write(f"{line}\n")

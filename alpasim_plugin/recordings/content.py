@@ -14,8 +14,7 @@ from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.types import F64, I64, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
-from alpasim_plugin.viewer.cells import WatchedCell
-from alpasim_plugin.viewer.page_data import Logs, no_frames
+from alpasim_plugin.viewer.cells import Logs, WatchedCell, no_frames
 from alpasim_plugin.viewer.pictures import Source, sources
 from evaluators.opening import Run
 from evaluators.report.rollouts import events_of
@@ -134,7 +133,7 @@ def collect(run: Run, cell: WatchedCell, logs: Logs) -> Recording:
     Args:
         run: The run.
         cell: One of its cells.
-        logs: Its logs (`alpasim_plugin.viewer.page_data.read_logs`).
+        logs: Its logs (`alpasim_plugin.viewer.cells.read_logs`).
 
     Raises:
         InputError: A log is damaged, there is none, or one has an instant before zero, which MCAP cannot write.

@@ -20,7 +20,7 @@ from alpasim_plugin.io.atomic import disk_error
 from alpasim_plugin.io.places import require_kernels
 from alpasim_plugin.plugins.interfaces import Policy, Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
-from alpasim_plugin.process.stdout import parts_print_to_stderr
+from alpasim_plugin.process.subprocesses import parts_print_to_stderr
 from alpasim_plugin.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest
 from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME, WHY_NAME
 from alpasim_plugin.run_folder.writer import write_steps

@@ -20,8 +20,7 @@ from typing import Any
 import alpasim_plugin
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.io.measured import share_measurements
-from alpasim_plugin.renderers.cache import cache_root, cached
+from alpasim_plugin.io.cache import cache_root, cached, share_measurements
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.run_folder.manifests import write_manifest
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
@@ -36,8 +35,8 @@ from alpasim_plugin.runtime.provenance import hardware
 
 KERNELS = "kernels"
 SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
-    "rasteriser": "alpasim_plugin.renderers.kernels:rasterise",
-    "gradient": "alpasim_plugin.renderers.kernels:fit",
+    "rasteriser": "alpasim_plugin.gaussians.sample_scene:rasterise",
+    "gradient": "alpasim_plugin.gaussians.sample_scene:fit",
     "map": "alpasim_plugin.fixers.gather:draw_and_gather",
 }
 SOURCES = ("gaussians", "semantic_map", "fixers")  # where kernels are

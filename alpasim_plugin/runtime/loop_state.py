@@ -14,7 +14,16 @@ from typing import overload
 import numpy as np
 
 from alpasim_plugin.control import Controller
-from alpasim_plugin.core.geometry import arc_lengths, interpolate, project, quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    ego_state_from_log,
+    interpolate,
+    project,
+    quat_from_matrix,
+    quat_from_yaw,
+    wrap_angle,
+    yaw_of,
+)
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -30,7 +39,6 @@ from alpasim_plugin.core.types import (
     Trajectory,
 )
 from alpasim_plugin.world.actors import ActorForecast, Actors
-from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig
 

@@ -11,8 +11,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
-from alpasim_plugin.plugins.parts.loading import COMMAND
-from alpasim_plugin.plugins.parts.source import own_code_digest
+from alpasim_plugin.plugins.parts.source import COMMAND, own_code_digest
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.run_folder.schema import rollout_folder
 from evaluators import resolve_evaluators

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.geometry import ego_states_from_log
 from alpasim_plugin.core.plan_check import unit_guess
 from alpasim_plugin.core.types import (
     F64,
@@ -37,7 +38,6 @@ from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.runtime.loop_state import PathEnd
-from alpasim_plugin.world.ego import ego_states_from_log
 
 REACH_S = 1.0
 MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
-from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scenario
+from alpasim_plugin.core.types import F64, GUESSED_SHARE, I64, RECORDED_SHARE, MetricSeries, RolloutLog, Scenario
 from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.plugins.parts import PartSpec
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
@@ -18,7 +18,7 @@ from evaluators import preset as find_preset
 from evaluators.metrics.route import lateral_bias
 
 # Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
-FIXER_FACTS = ("pose_error_m", "forecast_error_m")
+FIXER_FACTS = ("pose_error_m", "forecast_error_m", RECORDED_SHARE, GUESSED_SHARE)
 
 
 @dataclass(frozen=True)

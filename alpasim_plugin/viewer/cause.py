@@ -21,11 +21,10 @@ from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.log import decode_image, read_asl
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
-from alpasim_plugin.viewer.cells import Wanted, cells_of
+from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_logs
 from alpasim_plugin.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from alpasim_plugin.viewer.page import as_json, fill
-from alpasim_plugin.viewer.page_data import cell_data, lens_data, read_logs
-from alpasim_plugin.viewer.pictures import jpeg, smaller
+from alpasim_plugin.viewer.pictures import frame_rows, jpeg, seen_before, smaller
 from evaluators.metrics.outcomes import OUTCOMES, in_words, outcomes_of
 from evaluators.opening import Run
 
@@ -285,13 +284,18 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
         outcome=in_words(outcomes_of(rollout)),
         failed_us=failed_us,
         start_us=log.render_start_us,
-        sentences=[sentence(one, log.render_start_us) for one in partings],
+        sentences=[*(sentence(one, log.render_start_us) for one in partings), *_seen_before(run, rollout, failed_us)],
         looks=looks_of(log, rollout.renderer, failed_us),
         tried=[],
         depends=[],
         partings=partings,
         commands=commands(run, rollout, log.render_start_us, failed_us, partings),
     )
+
+
+def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[tuple[str, str]]:
+    text = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
+    return [("seen", f"{text}.")] if text else []
 
 
 def sentence(one: Parting, start_us: int) -> tuple[str, str]:

@@ -16,9 +16,8 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
-from alpasim_plugin.log import read_facts
 from alpasim_plugin.run_folder.rows import Rollout, series_by_cell
-from alpasim_plugin.run_folder.schema import FRAMES_NAME
+from alpasim_plugin.viewer.pictures import Rows, seen_before
 from evaluators.opening import Run
 from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
 from evaluators.report.rollouts import SERIES, Event, events_of
@@ -153,7 +152,7 @@ class Tracks:
 
 
 def drive_data(
-    run: Run, rollout: Rollout, log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks
+    run: Run, rollout: Rollout, log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks, frames: Rows
 ) -> dict[str, Any]:
     """Return what a page draws of a rollout, without its camera frames.
 
@@ -164,6 +163,7 @@ def drive_data(
         content: ``scenes/SCENE.json``.
         place: Where numbers count from.
         tracks: Gets the ways of the road users.
+        frames: Facts of its camera frames.
     """
     steps = run.steps_of(rollout)
     manifest = run.manifest(rollout)
@@ -176,7 +176,7 @@ def drive_data(
         "as_driven": log is not None,
         "plans": [] if log is None else [_plan(plan, place) for plan in log.plans],
         "curves": curves(steps, place),
-        "moments": moments(run, rollout, steps, manifest, place),
+        "moments": moments(rollout, steps, manifest, place, frames),
     }
 
 
@@ -247,7 +247,7 @@ def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
     return out
 
 
-def moments(run: Run, rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place) -> list[dict[str, Any]]:
+def moments(rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place, frames: Rows) -> list[dict[str, Any]]:
     """List what happened when: counted collisions and departures from the road, and frames that a guard replaced or named."""
     known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
     series = series_by_cell(known)
@@ -255,9 +255,10 @@ def moments(run: Run, rollout: Rollout, steps: pa.Table, manifest: Mapping[str, 
     found: list[dict[str, Any]] = []
     for event in events_of(rollout, series):
         ms = None if event.t_us is None else round((event.t_us - place.zero_us) / 1000)
-        text = event.what + _with_whom(event, manifest, first_us)
+        seen = "" if event.t_us is None else seen_before(frames, event.t_us)
+        text = event.what + _with_whom(event, manifest, first_us) + (f"; {seen}" if seen else "")
         found.append({"t": ms, "kind": event.kind, "text": text})
-    return found + _frame_events(run, rollout, place)
+    return found + _frame_events(frames, place)
 
 
 def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
@@ -268,12 +269,11 @@ def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
     return f" with {near[0]['actor_id']}" if near else ""
 
 
-def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, Any]]:
+def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
     """Return when an event of the frames began, such as a fixer's frame that was replaced; one that goes on is told once."""
-    path = run.file_of(rollout, FRAMES_NAME)
     found: list[dict[str, Any]] = []
     before: set[str] = set()
-    for row in read_facts(path) if path is not None else []:
+    for row in frames:
         now = set(str(row.get("events") or "").split())
         t_us = row.get("t_us")
         if isinstance(t_us, int):

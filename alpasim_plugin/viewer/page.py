@@ -18,8 +18,17 @@ from markupsafe import Markup
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.run_folder.reader import reporting
-from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted, shown_by_default, telling
-from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
+from alpasim_plugin.viewer.cells import (
+    Wanted,
+    WatchedCell,
+    cell_data,
+    cells_of,
+    check_wanted,
+    index_data,
+    read_logs,
+    shown_by_default,
+    telling,
+)
 from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.opening import Run, read_run
 from evaluators.report.flips import FlipKey

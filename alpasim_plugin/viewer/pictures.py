@@ -1,9 +1,9 @@
-"""The camera frames of a rollout, from its log or else its video, made small enough for a page."""
+"""The camera frames of a rollout, from its log or else its video, made small enough for a page, and where a fixer took them from."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,19 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import U8, LoggedImage, RolloutLog
-from alpasim_plugin.log import decode_image
+from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8, LoggedImage, RolloutLog
+from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.video import VideoReader
 from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import VIDEO_NAME
+from alpasim_plugin.run_folder.schema import FRAMES_NAME, VIDEO_NAME
 from evaluators.opening import Run
 
 JPEG_QUALITY = 76
+BEFORE_US = 1_000_000  # of an event: the pictures that led to it
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
+
+
+Rows = Sequence[Mapping[str, Any]]  # facts of the frames, as `frames.jsonl` has them
 
 
 @dataclass(frozen=True)
@@ -104,3 +108,28 @@ def smaller(rgb: U8, width_px: int) -> U8:
         return rgb
     size = (width_px, max(1, round(height * width_px / width)))
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def frame_rows(run: Run, rollout: Rollout) -> Rows:
+    """Return the facts of a rollout's camera frames; none where the run kept none."""
+    path = run.file_of(rollout, FRAMES_NAME)
+    return read_facts(path) if path is not None else []
+
+
+def trust_by_time(rows: Rows, camera: str) -> dict[int, str]:
+    """Return the text of `fixers.trust.trust_cells` of a camera's frames by time, microseconds."""
+    return {int(row["t_us"]): str(row[TRUST_CELLS]) for row in rows if row.get("camera") == camera and TRUST_CELLS in row}
+
+
+def seen_before(rows: Rows, t_us: int) -> str:
+    """Say how much of the pictures in the second before an instant was guessed and recorded; empty where no fixer says so.
+
+    Example:
+        >>> seen_before([{"t_us": 0, "guessed_share": 0.1, "recorded_share": 0.5}], 300_000)
+        '10 % of what it saw in the second before was made up by the fixer, 50 % was recorded'
+    """
+    near = [row for row in rows if GUESSED_SHARE in row and t_us - BEFORE_US <= int(row["t_us"]) <= t_us]
+    if not near:
+        return ""
+    guessed, recorded = (sum(float(row[name]) for row in near) / len(near) for name in (GUESSED_SHARE, RECORDED_SHARE))
+    return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace("%", " %")

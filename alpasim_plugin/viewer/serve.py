@@ -16,9 +16,8 @@ from urllib.parse import unquote, urlsplit
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.run_folder.reader import RunSoFar
-from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted
+from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cell_data, cells_of, check_wanted, index_data, read_logs
 from alpasim_plugin.viewer.page import Options, as_json, render
-from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from evaluators.opening import Run
 
 DOING = "serving a run"

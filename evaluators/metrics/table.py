@@ -391,4 +391,7 @@ STEP_SERIES = MetricTable({
     # Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
     "pose_error_m": MetricInfo("m", "none", "last", "distance of the shown frame's camera from where it was"),
     "forecast_error_m": MetricInfo("m", "none", "last", "distance of the forecast camera from where it was"),
+    # Of a fixer that looks at recorded frames.
+    "recorded_share": MetricInfo("", "none", "last", "share of the picture that is recorded frames", is_share=True),
+    "guessed_share": MetricInfo("", "none", "last", "share of the picture that the fixer made up", is_share=True),
 })  # fmt: skip

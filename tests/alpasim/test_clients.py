@@ -29,8 +29,8 @@ from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.score_logs import scenario_finder
 from alpasim_plugin.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
 from alpasim_plugin.wire.services import Stub, handlers
-from scenarios.library import shipped_names
 from scenarios.load import load_scenario
+from scenarios.suite import shipped_names
 
 pytestmark = pytest.mark.slow
 

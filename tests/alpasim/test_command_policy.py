@@ -25,8 +25,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.process import subprocesses as children
-from alpasim_plugin.process.stdout import MOST_BYTES, parts_print_to_stderr, say
-from alpasim_plugin.process.subprocesses import Child, end_children, exit_reason
+from alpasim_plugin.process.subprocesses import MOST_BYTES, Child, end_children, exit_reason, parts_print_to_stderr, say
 from policies.conformance import STRAIGHT, canned_scenario, observations
 
 pytestmark = pytest.mark.slow

@@ -28,8 +28,8 @@ from alpasim_plugin.wire import SERVICE_PATHS
 from alpasim_plugin.wire.services import OPTIONS, handlers, methods
 from evaluators import reduce_rollout, score
 from evaluators.metrics.presets import preset
-from scenarios.library import shipped_names
 from scenarios.load import load_scenario
+from scenarios.suite import shipped_names
 
 pytestmark = pytest.mark.slow
 

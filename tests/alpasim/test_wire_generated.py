@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.wire.protos import compile as compiling
+from tests.alpasim import compile_protos as compiling
 
-PROTOS = Path(compiling.__file__).parent
+PROTOS = compiling.PROTOS
 WIRE = PROTOS.parent
 
 # Loads the package from a copy outside the project under another name, as the bridge distribution has it, then a foreign file that defines

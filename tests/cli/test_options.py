@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import pytest
 import typer
 
-from alpasim_plugin.cli import decide, gate, run, serve, serve_policy, view
+from alpasim_plugin.cli import decide, gate, run, serve, view
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, Only, command_of
 from alpasim_plugin.core.flags import Flag, Positional
@@ -39,7 +39,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_a_run_gets_its_cluster_its_store_its_limit_and_its_retries(called: Any, tmp_path: Path) -> None:
-    cluster = ("--executor", "slurm:cpu", "--cores", "2", "--gpus", "0.5", "--memory", "7.5", "--store", str(tmp_path))
+    cluster = ("--executor", "slurm:cpu?cores=2&gpus=0.5&memory=7.5", "--store", str(tmp_path))
     more = ("--time-limit", "90", "--retry", "--certify", "none", "--no-report", "--wait", "--workers", "3")
     given = called(run, "execute_run", "--renderer", "clean", *cluster, *more, "--out", str(tmp_path / "out"), "smoke/straight")
     resources = given["executor"].resources
@@ -48,10 +48,9 @@ def test_a_run_gets_its_cluster_its_store_its_limit_and_its_retries(called: Any,
     assert (given["certificate"], given["report"], given["wait"], given["resume"]) == ("none", False, True, False)
 
 
-@pytest.mark.parametrize("option", ["--cores", "--gpus", "--memory"])
-def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--renderer", "clean", option, "1", "--dry-run", "smoke/straight"]) == 2
-    assert f"{option} with --executor local" in capsys.readouterr().err
+def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--renderer", "clean", "--executor", "local?cores=1", "--dry-run", "smoke/straight"]) == 2
+    assert "--executor local?cores=1" in capsys.readouterr().err
 
 
 def test_a_decision_gets_its_question_and_its_design(called: Any) -> None:
@@ -68,18 +67,18 @@ def test_a_decision_gets_its_question_and_its_design(called: Any) -> None:
 
 
 def test_a_gate_that_drives_takes_the_options_of_a_decision(called: Any, tmp_path: Path) -> None:
-    words = ("gate", str(tmp_path), "--until-decided", "--scenes", "smoke/straight", "--renderer", "clean,3dgs", "--images", "none")
-    given = called(gate, "decide_into", *words, "--order-seed", "5", "--budget", "12", "--set", "timing.duration_us=1000000")
-    assert (given["design"].order_seed, given["design"].budget, given["plan"].options.images) == (5, 12, "none")
+    words = ("gate", str(tmp_path), "--until-decided", "--scenes", "smoke/straight", "--renderer", "clean,3dgs")
+    given = called(gate, "decide_into", *words, "--order", "stratified", "--budget", "12", "--set", "timing.duration_us=1000000")
+    assert (given["design"].order, given["design"].budget) == ("stratified", 12)
     assert [cell.ref.overrides for cell in given["plan"].cells] == [("timing.duration_us=1000000",)] * 2
 
 
 def test_a_page_of_drives_gets_its_limits(called: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(view, "find_cell", lambda what, doing: (what, None))
-    more = ("--camera", "front", "--cells", "3", "--max-mb", "5", "--every", "2", "--width", "128", "--seed", "1", "--serve", "0")
+    more = ("--camera", "front", "--cells", "3", "--max-mb", "5", "--width", "128", "--seed", "1", "--serve", "0")
     given = called(view, "_serve", "view", str(tmp_path), *more)
     options = given["options"]
-    assert (options.camera, options.fine.stride, options.fine.width_px, options.max_bytes) == ("front", 2, 128, 5_000_000)
+    assert (options.camera, options.fine.width_px, options.max_bytes) == ("front", 128, 5_000_000)
     assert given["wanted"].seeds == (1,)
 
 
@@ -95,7 +94,7 @@ def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path
 @pytest.mark.parametrize("words", [("serve", "--renderer", "identity", "--upstream", "host:1"), ("serve-policy", "lane-camera")])
 def test_callers_of_every_server_are_let_in_as_asked(called: Any, tmp_path: Path, words: tuple[str, ...]) -> None:
     files = ("--tls-cert", "cert.pem", "--tls-key", "key.pem", "--tls-client-ca", "callers.pem", "--token-file", str(tmp_path / "token"))
-    given = called(serve if words[0] == "serve" else serve_policy, "Host", *words, "--drain-s", "1", "--expiry-s", "9", *files)["policy"]
+    given = called(serve, "Host", *words, "--drain-s", "1", "--expiry-s", "9", *files)["policy"]
     assert (given.tls_cert, given.tls_key, given.tls_client_ca) == (Path("cert.pem"), Path("key.pem"), Path("callers.pem"))
     assert (given.token_file, given.drain_s, given.expiry_s) == (tmp_path / "token", 1.0, 9.0)
 

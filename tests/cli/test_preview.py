@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.preview import window
 from alpasim_plugin.gaussians import GaussianCloud, write_ply
-from alpasim_plugin.runtime.preview import window
 
 SCENE = """
 version: 1

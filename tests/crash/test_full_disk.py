@@ -26,16 +26,23 @@ class Disk:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give the run that no disk refused."""
+    folder = tmp_path_factory.mktemp("whole")
+    run(folder, plan_of((0,)))
+    return folder
+
+
 QUICK = (4, 10, 12)  # facts of a rollout, a manifest, a table
 WRITES = 17  # of the run
 
 
 @pytest.mark.parametrize("refused", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in range(1, WRITES + 1)])
 def test_a_run_with_a_refused_write_says_so_and_the_same_command_finishes_it(
-    refused: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    refused: int, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = plan_of((0,))
-    run(tmp_path / "whole", plan)
     disk = Disk(refused)
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", disk.fsync)
@@ -53,4 +60,4 @@ def test_a_run_with_a_refused_write_says_so_and_the_same_command_finishes_it(
     assert len(again.results) == 2
     assert finished <= 2
     assert inspect_run(tmp_path / "full", full=True).whole
-    assert comparable(tmp_path / "full") == comparable(tmp_path / "whole")
+    assert comparable(tmp_path / "full") == comparable(whole)

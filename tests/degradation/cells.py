@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from alpasim_plugin.cli.main import run_command
 from tests.other_user import NOBODY, run_as_nobody
 
 REPO = Path(__file__).resolve().parents[2]
@@ -108,8 +109,7 @@ def make_work(work: Path) -> None:
         (work / name).mkdir()
     drive = [*DRIVE, "--seeds", "2", "--workers", "1", "--out", str(work / "runs" / "one"), "smoke/straight"]
     drive[drive.index("constant-velocity")] = "constant-velocity,pure-pursuit"
-    done = subprocess.run([sys.executable, "-m", "alpasim_plugin.cli.main", *drive], capture_output=True, text=True, cwd=REPO)
-    assert done.returncode == 0, done.stderr
+    assert run_command(drive) == 0
 
 
 def outcome(machine: Machine, verb: str, made: Path, work: Path) -> Outcome:

@@ -158,7 +158,7 @@ def shortened(words: tuple[str, ...]) -> list[str]:
     args = ["scenario.yaml" if word == "SCENARIO" else re.sub("suites/(urban|hard)", "suites/smoke", word) for word in words]
     if args[0] not in verbs() or args[0] == "run":
         fitting = [] if "suites/first" in args else NOTHING_FITTED
-        short = LONGER if "--timeline" in args else SHORT
+        short = LONGER if "timing.timeline=alpasim" in args else SHORT
         more = () if any("drive.csv" in word for word in args) else (*short, *fitting)
         return [*args, *more, "--seeds", "1"]
     return args

@@ -10,7 +10,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.drives.frames import car_begins, moved_px, write_frames
+from alpasim_plugin.drives.sfm import car_begins, moved_px, write_frames
 from tests.drives.test_sfm import film, told
 
 SIZE = (180, 320)

@@ -1,7 +1,7 @@
 """AlpaSim's known defects and surprises, each by name: what preset ``alpasim`` reproduces, and what ``strict`` does instead.
 
-The numbers D-01, D-02, ... are those of docs/scoring-logs.md. Quirks of AlpaSim's runtime, driver and physics are not about scoring a log
-and have no test here.
+The numbers D-01, D-02, ... are those of docs/experiments/alpasim-parity.md. Quirks of AlpaSim's runtime, driver and physics are
+not about scoring a log and have no test here.
 """
 
 from __future__ import annotations

@@ -191,22 +191,22 @@ def test_without_gymnasium_the_message_names_the_extra(monkeypatch: pytest.Monke
     importlib.reload(doors)
 
 
-def blocks() -> list[str]:
-    page = Path(__file__).resolve().parents[2] / "docs" / "gym.md"
+def blocks(name: str) -> list[str]:
+    page = Path(__file__).resolve().parents[2] / "docs" / name
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
 @pytest.mark.slow
 def test_the_example_of_the_page_runs() -> None:
     space: dict[str, Any] = {}
-    exec(compile(blocks()[0], "docs/gym.md", "exec"), space)
+    exec(compile(blocks("gym.md")[0], "docs/gym.md", "exec"), space)
     assert space["seen"]["camera"].shape == (54, 96, 3)
 
 
 @pytest.mark.slow
 def test_the_training_script_of_the_page_runs(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
-    (tmp_path / "train_ppo.py").write_text(blocks()[1])
+    (tmp_path / "train_ppo.py").write_text(blocks("experiments/ppo.md")[0])
     repo = Path(__file__).resolve().parents[2]
     environment = os.environ | {"PYTHONPATH": str(repo)}
     words = [sys.executable, "train_ppo.py", "0.05"]

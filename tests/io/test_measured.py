@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io import measured as module
-from alpasim_plugin.io.measured import measured, share_measurements
+from alpasim_plugin.io import cache as module
+from alpasim_plugin.io.cache import measured, share_measurements
 from alpasim_plugin.runtime.executors.local import run_in_processes
 
 

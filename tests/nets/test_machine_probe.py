@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.io import measured
-from alpasim_plugin.io.measured import share_measurements
+from alpasim_plugin.io import cache
+from alpasim_plugin.io.cache import share_measurements
 from alpasim_plugin.nets import machine_probe
 from alpasim_plugin.nets.machine_probe import Probe, choose_precision, choose_threads, probe_precision
 
@@ -41,7 +41,7 @@ def test_processes_of_a_run_on_a_node_choose_what_the_first_one_measured(monkeyp
     share_measurements(tmp_path / "run")
     try:
         mine = choose_threads(2), probe_precision()
-        monkeypatch.setattr(measured, "_taken", {})  # as in another process
+        monkeypatch.setattr(cache, "_taken", {})  # as in another process
         monkeypatch.setattr(machine_probe, "_ms", lambda *pair: pytest.fail("measured again"))
         assert (choose_threads(2), probe_precision()) == mine
         assert choose_precision().probe == mine[1]

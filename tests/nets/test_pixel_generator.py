@@ -6,9 +6,8 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.machine_probe import choose_precision
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState, hole_mask, pixel_source, sparse_source
 from alpasim_plugin.nets.pixel_layers import Upsample, cells, pixels
-from alpasim_plugin.nets.pixel_source import hole_mask, pixel_source, sparse_source
 
 SMALL = PixelSizes((8, 12, 16), (1, 0, 2, 1, 1), 8, 4)
 

@@ -14,7 +14,7 @@ import pytest
 from alpasim_plugin import open_run
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.notebook.opening import OpenRollout, OpenRun
+from alpasim_plugin.notebook import OpenRollout, OpenRun
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.plugins.parts import resolve
-from alpasim_plugin.plugins.parts.loading import load
+from alpasim_plugin.plugins.parts.source import load
 from alpasim_plugin.process.subprocesses import OURS, SAFE_PATH, own_path_only
 from tests.examples import first_of
 

@@ -9,11 +9,9 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.plugins.parts import complete, names, resolve, resolve_renderer, spec
-from alpasim_plugin.plugins.parts.builtin import BUILTIN
-from alpasim_plugin.plugins.parts.loading import load
 from alpasim_plugin.plugins.parts.resolve import PLAIN_KINDS
-from alpasim_plugin.plugins.parts.source import OWN_ROOT, code_digest, code_files, reached
-from alpasim_plugin.plugins.parts.spec import KINDS
+from alpasim_plugin.plugins.parts.source import OWN_ROOT, code_digest, code_files, load, reached
+from alpasim_plugin.plugins.parts.spec import BUILTIN, KINDS
 
 DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "missing", "metrics", "controller")
 

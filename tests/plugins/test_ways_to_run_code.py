@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.run_folder.schema import ROLLOUTS_FOLDER
 from tests.io.checksum_files import vouch_for
 from tests.plugins.test_hostile_folder import DRIVE, simrun
@@ -204,7 +205,7 @@ WAYS: dict[str, Way] = {
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
-    assert simrun(folder, *DRIVE, "--policy", "constant-velocity", "--out", "run", "smoke/straight").returncode == 0
+    assert run_command([*DRIVE, "--policy", "constant-velocity", "--workers", "1", "--out", str(folder / "run"), "smoke/straight"]) == 0
     return folder / "run"
 
 

@@ -13,7 +13,7 @@ from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.renderers.imported import Exposures, ImportedRenderer
+from alpasim_plugin.renderers.reconstruction import Exposures, ImportedRenderer
 from alpasim_plugin.renderers.recorded import posed_photograph
 from tests.renderers.recorded_drive import EXPOSURE, HIGH, SKY_LEVEL, WIDE, recorded_drive
 

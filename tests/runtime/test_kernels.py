@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.renderers.cache import cache_root
+from alpasim_plugin.io.cache import cache_root
 from alpasim_plugin.runtime.execute import KERNELS, SUBJECTS, compile_for, compile_kernels, needed
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import ScenarioRef

@@ -197,15 +197,17 @@ def test_what_an_earlier_driver_has_left_is_not_done_again() -> None:
 
 def test_the_text_of_the_option_is_understood() -> None:
     assert parse_executor("local") is LOCAL
-    assert parse_executor("ray:10.0.0.1:6379", gpus=0.5).where == "10.0.0.1:6379"
-    assert parse_executor("slurm:cpu", cores=4).resources.cores == 4
+    assert parse_executor("ray:10.0.0.1:6379?gpus=0.5").where == "10.0.0.1:6379"
+    assert parse_executor("slurm:cpu?cores=4").resources.cores == 4
     assert str(parse_executor("slurm:cpu")) == "slurm:cpu"
 
 
-@pytest.mark.parametrize(("text", "cores"), [("dask", None), ("local:a", None), ("local", 2), ("", None)])
-def test_an_executor_that_is_not_there_is_refused(text: str, cores: int | None) -> None:
+@pytest.mark.parametrize(
+    "text", ["dask", "local:a", "local?cores=2", "", "ray?cores=0", "ray?cores=1.5", "slurm?gpus=nan", "ray?memory=0", "ray?nodes=2"]
+)
+def test_an_executor_that_is_not_there_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="choosing an executor"):
-        parse_executor(text, cores=cores)
+        parse_executor(text)
 
 
 def test_a_node_is_compared_by_name() -> None:

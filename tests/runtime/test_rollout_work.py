@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 
-from alpasim_plugin.io import measured
+from alpasim_plugin.io import cache
 from alpasim_plugin.runtime.commits import RolloutResult
 from alpasim_plugin.runtime.executors.assignment import measured_folder
 from alpasim_plugin.runtime.executors.base import Node
@@ -26,11 +26,11 @@ def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, mon
             assert (result.manifest["status"], result.manifest["node"]) == ("ok", "n1")
             folder = measured_folder(run)
             assert folder is not None
-            assert measured._folder == folder
-            measured.measured("speed", lambda: {"ms": 1.0})
+            assert cache._folder == folder
+            cache.measured("speed", lambda: {"ms": 1.0})
             assert (folder / "speed.json").exists()
     finally:
-        measured.share_measurements(None)
+        cache.share_measurements(None)
 
 
 def test_the_record_of_a_run_says_what_was_chosen_on_each_node() -> None:

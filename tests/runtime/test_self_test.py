@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.cli.gate import CONTROL, REFERENCE, SUITE, Trial, _judge, broken_renderers
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.runtime.self_test import CONTROL, REFERENCE, SUITE, Trial, _judge, broken_renderers
 from evaluators.statistics.gate import GateSpec, MetricRule, load_gate
 from scenarios.suite import load_suite
 from tests.evaluators.test_gate import rows

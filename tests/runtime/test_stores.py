@@ -18,9 +18,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.runtime.commits import Commits, Index, RolloutResult
+from alpasim_plugin.runtime.commits import Commits, FolderObjects, Index, Objects, RemoteObjects, RolloutResult, open_objects
 from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.runtime.objects import FolderObjects, Objects, RemoteObjects, open_objects
 from alpasim_plugin.runtime.run import execute_run
 from tests.runtime.s3_server import Line, s3_line
 from tests.runtime.test_runs import Announced, cheap_plan, comparable

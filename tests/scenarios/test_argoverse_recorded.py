@@ -14,7 +14,7 @@ from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.argoverse import read_argoverse, read_calibration, read_ego_poses
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 from tests.examples import first_of
 from tests.scenarios.real_drive import boxes_at, footprint, ruling
 

@@ -13,7 +13,7 @@ from alpasim_plugin.core.types import HeightField
 from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.commonroad import read_commonroad, read_obstacles
 from scenarios.commonroad_map import read_lanelets
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 from tests.scenarios.make_commonroad import LANES, TRAFFIC, bound, document, drive, lanelet, obstacle, points, state, write_commonroad
 from tests.scenarios.real_drive import boxes_at, footprint, ruling
 

@@ -16,7 +16,7 @@ from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.cosmos import paint_of, read_cosmos, read_layer, read_poses, sign_pose
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, front_camera, lens_of, read_lenses
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 from tests.scenarios.ftheta import project_ftheta
 from tests.scenarios.make_cosmos import CLIP, WIDE, cuboid, label, lane, layers, polyline, poses, write_cosmos
 from tests.scenarios.real_drive import ruling

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, yaw_from_quat, yaw_of
+from alpasim_plugin.core.geometry import ego_state_from_log, interpolate, yaw_from_quat, yaw_of
 from alpasim_plugin.core.types import F64, Box, Scenario
 from alpasim_plugin.world.actors import make_actors
-from alpasim_plugin.world.ego import ego_state_from_log
-from scenarios.library import LIBRARY, shipped, shipped_names, suites
 from scenarios.load import load_scenario
-from scenarios.suite import load_suite
+from scenarios.suite import LIBRARY, load_suite, shipped, shipped_names, suites
 from tests.examples import first_of
 
 BUILT = [name for name in shipped_names() if not name.startswith("real/")]

@@ -18,7 +18,7 @@ from alpasim_plugin.core.lane_areas import lane_polygon
 from scenarios.opendrive import T_enu_earth, T_local_map, geographic_origin, lane_map_of
 from scenarios.opendrive_alpasim import alpasim_map
 from scenarios.opendrive_road import Cubic, Geometry, OdrMap, cubics_at, parse_map, reference_line
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 FILES = SourceFiles("reading OpenDRIVE")
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import yaml
 
-from scenarios.library import LIBRARY, shipped_names
 from scenarios.load import load_scenario
 from scenarios.schema import SCHEMA_FILE, ScenarioSpec, json_schema, models
 from scenarios.schema_docs import LIMITS_PAGE, limit_tables, page_of
+from scenarios.suite import LIBRARY, shipped_names
 
 
 def test_committed_schema_is_current() -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.geometry import ego_state_from_log, interpolate
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts import names
 from alpasim_plugin.world.actors import make_actors
-from alpasim_plugin.world.ego import ego_state_from_log
 from scenarios.load import load_scenario
 from scenarios.sources import detect
 

@@ -17,10 +17,10 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
+from scenarios.cosmos_camera import pixel_to_angle
 from scenarios.load import load_scenario
 from scenarios.map_lines import alpasim_view, rails, with_vertices
 from scenarios.usdz import read_usdz
-from scenarios.usdz_camera import pixel_to_angle
 from scenarios.usdz_tables import table_ids
 from scenarios.usdz_write import alpasim_cameras, write_usdz
 

@@ -32,7 +32,7 @@ from alpasim_plugin.semantic_map.prepare import ActorBox, Area, MapExtras, Prepa
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL, MapStyle
 from scenarios.cosmos import read_cosmos, read_layer
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 
 SIZE = (1280, 704)
 N_FRAMES = 57

@@ -15,7 +15,7 @@ from alpasim_plugin.semantic_map.draw import draw_map, kernel_camera
 from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
-from scenarios.reading import SourceFiles
+from scenarios.recorded import SourceFiles
 from tests.examples import first_of
 from tests.scenarios.ftheta import project_ftheta
 from tests.semantic_map.cosmos_agreement import AS_PUBLISHED, OPENGL, SOLID, compare, mounts, read_clip

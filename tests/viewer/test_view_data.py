@@ -18,11 +18,10 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Vehicle
-from alpasim_plugin.log import read_asl, write_mp4
+from alpasim_plugin.log import read_asl, read_facts, write_facts, write_mp4
 from alpasim_plugin.run_folder.rows import series_by_cell
-from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, shown_by_default
+from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, check_wanted, index_data, read_logs, shown_by_default
 from alpasim_plugin.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
-from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.opening import read_run
 from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
@@ -137,6 +136,24 @@ def test_events_are_at_the_times_that_the_report_states(watched_run: Path) -> No
             assert frames == [("frame: replaced", 100 * (WATCHED.steps // 3))]
             seen += len(stated)
     assert seen >= 3
+
+
+def test_where_pictures_come_from_is_shown_and_said_before_an_event(watched_run: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(watched_run, tmp_path / "run"))
+    run = read_run(root)
+    cell = next(one for one in cells_of(run) if one.flips)
+    told = []
+    for rollout in cell.rollouts:
+        path = root / rollout.path / "frames.jsonl"
+        cells = [f"1x1:{i % 10}f" for i, _ in enumerate(read_facts(path))]
+        own = {"recorded_share": 0.75, "guessed_share": 0.125}
+        write_facts(path, [row | own | {"trust_cells": text} for row, text in zip(read_facts(path), cells, strict=True)])
+        told.append(cells)
+    drives = cell_data(run, cell, read_logs(run, cell), Fineness())["drives"]
+    assert [drive["cameras"][0]["trust"] for drive in drives] == told
+    words = [one["text"] for drive in drives for one in drive["moments"] if one["kind"] != "frame"]
+    assert words
+    assert all("12 % of what it saw in the second before was made up by the fixer, 75 % was recorded" in text for text in words)
 
 
 def test_what_is_not_valid_has_no_value_and_a_reason(small_run: Path) -> None:

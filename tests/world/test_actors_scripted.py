@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.geometry import speeds, yaw_from_quat
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.world.ego import speeds
 from alpasim_plugin.world.path import polyline_path
-from alpasim_plugin.world.scripted import (
+from scenarios.ego_path import (
     brake_rows,
     cut_in_track,
     grid,

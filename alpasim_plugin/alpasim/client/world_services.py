@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.alpasim.client.channel import Address, Service
-from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop
+from alpasim_plugin.control.tracker import check_interval, check_plan, coast_to_stop
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, trajectory_from_poses
 from alpasim_plugin.core.types import F64, EgoState, Scenario, Trajectory, Vehicle

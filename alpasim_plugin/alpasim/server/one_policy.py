@@ -17,8 +17,8 @@ import numpy as np
 
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.core.blank import blank_scenario
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.plan_check import blank_scenario
 from alpasim_plugin.core.types import Scenario, Trajectory
 from alpasim_plugin.plugins.interfaces import Policy, complete
 

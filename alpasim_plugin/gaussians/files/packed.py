@@ -23,7 +23,7 @@ from alpasim_plugin.gaussians.sh import C0
 from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.io.limits import GAUSSIANS
 from alpasim_plugin.io.reading import read_bytes
-from alpasim_plugin.io.reading.packed import unzstd
+from alpasim_plugin.io.reading.files import unzstd
 
 CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

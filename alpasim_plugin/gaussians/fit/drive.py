@@ -12,12 +12,11 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, Box
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.fit.balance import balances, gain_between
-from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps
+from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
+from alpasim_plugin.gaussians.fit.lens import balances, gain_between
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.fit.segment_sky import sky_masks
 from alpasim_plugin.gaussians.fit.start import Start, start_from_maps, start_in_boxes
 from alpasim_plugin.gaussians.fit.tracks import Tracks, follow, place
 from alpasim_plugin.gaussians.fit.views import PosedView

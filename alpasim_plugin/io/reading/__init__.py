@@ -2,9 +2,9 @@
 
 Anything that a parser raises becomes an `InputError` that names the file (`parsing`). Which module reads what:
 
-- `files`: bytes, text, JSON (with limits, and of a stated shape), XML, and the check of a path that a library opens itself.
-- `packed`: gzip, zstd and zip, decompressed to a stated size at most.
-- `arrays`: NumPy files, by their header against the file's size, and checkpoints.
+- `files`: bytes, text, JSON (with limits, and of a stated shape), XML, the check of a path that a library opens itself, and gzip, zstd
+  and zip, decompressed to a stated size at most.
+- `arrays`: NumPy files, by their header against the file's size, and headers and checkpoints of weights.
 - `images`: pictures, by their header before they are decoded.
 - `tables`: parquet and Arrow tables with typed columns.
 

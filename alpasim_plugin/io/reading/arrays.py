@@ -1,4 +1,4 @@
-"""NumPy files, whose header is compared with their size before memory is taken (pickles are never read), and checkpoints of training."""
+"""Arrays: NumPy files, whose header is compared with their size before memory is taken (pickles are never read), and files of weights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from alpasim_plugin.io.reading.files import FETCH_AGAIN, check_regular, open_reg
 
 if TYPE_CHECKING:
     from torch import Tensor
-
 
 Array = np.ndarray[Any, Any]
 
@@ -86,3 +85,17 @@ def read_checkpoint(path: Path, doing: str, facts: str) -> tuple[dict[str, str],
         raise InputError(doing, str(path), f"it was begun as {begun}, this is {facts}", "choose another folder")
     with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
         return meta, load_file(str(path))
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """Return the text entries in a safetensors file's header.
+
+    Raises:
+        InputError: No file, or anything but safetensors (a pickle, for example).
+    """
+    from safetensors import safe_open
+
+    doing, do = "reading the header of a safetensors file", "give a whole .safetensors file"
+    check_regular(path, doing, WEIGHT_BYTES)
+    with parsing(doing, path, do, "not safetensors"), safe_open(path, framework="np") as file:
+        return dict(file.metadata() or {})

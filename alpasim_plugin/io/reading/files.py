@@ -1,4 +1,7 @@
-"""A file's bytes, text, JSON and XML: a regular file, capped in size, with limits on depth and numbers, or a four-part error."""
+"""A file's bytes, text, JSON and XML: a regular file, capped in size, with limits on depth and numbers, or a four-part error.
+
+Packed data are unpacked to a stated size at most: a few bytes can claim to be terabytes.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import json
 import math
 import os
 import stat
+import zlib
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -15,7 +19,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from alpasim_plugin.core.errors import InputError, SimrunError
-from alpasim_plugin.io.limits import DEPTH, FILE_BYTES, JSON_BYTES, XML_ELEMENTS, Bound
+from alpasim_plugin.io.limits import DEPTH, FILE_BYTES, JSON_BYTES, MEMBERS, UNPACKED_BYTES, XML_ELEMENTS, Bound
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -312,3 +316,64 @@ def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element
         if isinstance(error.__cause__, ValueError | LookupError) and not isinstance(error.__cause__, ElementTree.ParseError):
             raise InputError(doing, str(where), f"an unreadable text encoding: {error.__cause__}", "save the file as UTF-8") from error
         raise
+
+
+GZIP = 16 + zlib.MAX_WBITS
+
+
+def gunzip(data: bytes, most: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> bytes:
+    """Unpack gzip data.
+
+    Args:
+        data: One gzip member; what follows it is ignored.
+        most: Bytes that the caller can use; `alpasim_plugin.io.limits.UNPACKED_BYTES` holds in any case.
+        where: The file, for messages.
+        doing: What the caller is doing, for messages.
+        do_this: Last part of the errors.
+
+    Raises:
+        InputError: Damaged data, data that end too early, or more than ``most``.
+    """
+    most = min(most, int(UNPACKED_BYTES.high))
+    with parsing(doing, where, do_this, "damaged gzip data"):
+        unpacker = zlib.decompressobj(GZIP)
+        out = unpacker.decompress(data, most + 1)
+    if len(out) > most:
+        raise InputError(doing, str(where), f"gzip data of more than {most} bytes", do_this)
+    if not unpacker.eof:
+        raise InputError(doing, str(where), f"gzip data that end after {len(out)} bytes", do_this)
+    return out
+
+
+def unzstd(data: bytes, expected: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> bytes:
+    """Unpack a zstd frame of a size that is known; see `gunzip`.
+
+    Raises:
+        InputError: Damaged data, or another size than expected.
+    """
+    import zstandard
+
+    UNPACKED_BYTES.check(expected, doing, where)
+    with parsing(doing, where, do_this, "damaged zstd data"):
+        out = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data).read(expected + 1) if expected else b""
+    if len(out) != expected:
+        found = f"more than {expected} bytes" if len(out) > expected else f"{len(out)} of {expected} bytes"
+        raise InputError(doing, str(where), f"zstd data of {found}", do_this)
+    return out
+
+
+def check_names(names: list[str], where: Path | str, doing: str, bound: Bound = MEMBERS) -> None:
+    """Refuse the members of an archive if one could leave it, two share a name, or there are too many.
+
+    Raises:
+        InputError: They do.
+    """
+    bound.check(len(names), doing, where)
+    seen: set[str] = set()
+    for name in names:
+        parts = name.replace("\\", "/").split("/")
+        if name.startswith("/") or "\\" in name or ".." in parts or "\0" in name:
+            raise InputError(doing, str(where), f"a member named {name!r}, outside the archive", "do not use this file")
+        if name in seen:
+            raise InputError(doing, str(where), f"member {name!r} twice", "write the archive again")
+        seen.add(name)

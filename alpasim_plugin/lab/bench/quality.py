@@ -122,7 +122,7 @@ def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> Var
     if fixer is None or variant.spec is None or not isinstance(variant.spec.settings, FixerSettings):
         return VariantResult(np.array(clip.truth if variant.label == TRUTH else clip.render), (), {})
     tally, frames = StreamStats(), []
-    for block in refine_frames(_frames(clip, variant.spec.settings), fixer):
+    for block in refine_frames(fixer_input(clip, variant.spec.settings), fixer):
         tally.add(block)
         frames += [frame.rgb for frame in block.fixed]
     return VariantResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
@@ -146,7 +146,8 @@ def measure(clip: QualityClip, variant: Variant, result: VariantResult, seed: in
     }
 
 
-def _frames(clip: QualityClip, settings: FixerSettings) -> Iterator[tuple[Frame, U8 | None]]:
+def fixer_input(clip: QualityClip, settings: FixerSettings) -> Iterator[tuple[Frame, U8 | None]]:
+    """Yield every frame of a clip as a fixer gets it, with its map where the settings use one."""
     recorded = clip.references(settings.references, settings.recording == "past")
     for i, (t_us, references) in enumerate(zip(clip.t_us, recorded, strict=True)):
         alpha = clip.opacity[i].astype(np.float32) / np.float32(255)

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, I64, U8, Box
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.references import ReferenceIndex
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, on_boxes
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 
@@ -73,8 +73,7 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
     if found is None or not draw.count:
         return out
     references, recorded, boxes = found
-    K = references.K.copy()
-    K[:2, 2] -= (columns.start, rows.start)
+    K = _cropped(references.K, rows, columns)
     last: Sequence[int] = ()
     for t, i in enumerate(index):
         wanted, t_us = draw.skipped + draw.count, int(references.t_us[i])
@@ -86,6 +85,24 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
         pictures = [_misplaced(_picture(sequence, at), error) for at, error in zip(places, draw.errors, strict=False)]
         for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)), boxes)):
             out[t, slot] = carried
+    return out
+
+
+def road_users(sequence: PairSequence, index: I64, rows: slice, columns: slice) -> Bool:
+    """Return which pixels of some frames of a sequence of pairs show road users, hidden ones among them: ``(T, h, w)``."""
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    found = _opened(sequence)
+    if found is None:
+        return np.zeros((len(index), *shape), dtype=bool)
+    references, _, boxes = found
+    K = _cropped(references.K, rows, columns)
+    views = (references.target(int(i), K, rows, columns) for i in index)
+    return np.stack([on_boxes(shape, K, view.T_world_camera, view.actors, boxes) for view in views])
+
+
+def _cropped(K: F64, rows: slice, columns: slice) -> F64:
+    out = K.copy()
+    out[:2, 2] -= (columns.start, rows.start)
     return out
 
 

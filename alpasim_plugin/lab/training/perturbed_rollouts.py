@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import se3, yaw_of
+from alpasim_plugin.core.geometry import ego_state_from_log, se3, yaw_of
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.policy_expert import STEP_S, DrivingStyle, ReferenceLine, acceleration, advance, leader_on
-from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import Bodies, bodies_from
 from alpasim_plugin.world.path import Path, smooth_path

@@ -1,7 +1,7 @@
 """The objectives of a generator in pixels on one shared rollout (OneFixer, Sec. 3.2 and 3.3), frame by frame.
 
     rollout      x^i = G(z^i_1 | state^<i)                        the deployed step, with gradients through the last k frames
-    picture      | x^i - x^i_0 |                                  at every frame
+    picture      | x^i - x^i_0 |                                  at every frame; pixels of road users count more
     perceptual   d(x^w, x^w_0)                                    at sampled frames w
     temporal     | (x^i - x^i-1) - (x^i_0 - x^i-1_0) |            differences of neighbouring frames
     grid         evenness of steps over the generator's cells     `training.grid_term`
@@ -28,14 +28,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.lab.training.grid_term import grid_term
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
-from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState, pixel_source
 from alpasim_plugin.nets.reference_blend import Sources
 from alpasim_plugin.nets.schedule import interpolant
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
 NEAR, AROUND = 0.02, 5  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
+ROAD_USER = 4  # a policy looks at road users, who are few pixels
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
 
@@ -86,6 +86,7 @@ class PixelSample:
         t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
         references: ``(B, T, K, H, W, 4)`` recorded frames in the view: colour in [-1, 1], and where it holds, 0 to 1.
             None: there is none.
+        road_users: ``(B, T, H, W, 1)`` bool; pixels whose errors count `ROAD_USER` times. None: all count alike.
     """
 
     render: Tensor
@@ -100,6 +101,7 @@ class PixelSample:
     corner: tuple[int, int]
     t_history: Tensor
     references: Tensor | None = None
+    road_users: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -156,9 +158,13 @@ def pixel_losses(
             with torch.no_grad():
                 _, state = net(render, opacity, sdmap, before, interpolant(truth, source, t[:, None, None, None]), t, references)
     made = torch.stack(outputs, dim=1)
-    picture = (made - sample.truth).abs().mean()
+    weight = torch.ones_like(sample.opacity)
+    if sample.road_users is not None:
+        weight = weight + (ROAD_USER - 1) * sample.road_users
+    weight = weight / weight.mean()
+    picture = (weight * (made - sample.truth).abs()).mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
-    temporal = moved.abs().mean() if objectives.temporal and frames > 1 else zero
+    temporal = (weight[:, 1:] * moved.abs()).mean() if objectives.temporal and frames > 1 else zero
     perceptual = zero
     if objectives.perceptual and distance is not None:
         (top, left), chosen = sample.corner, list(sample.perceptual_frames)

@@ -47,6 +47,11 @@ class FrameBatch(Protocol):
         ...
 
     @property
+    def road_users(self) -> Tensor:
+        """``(B, T, 1, H, W)`` bool; what shows a road user's box."""
+        ...
+
+    @property
     def fresh(self) -> Tensor:
         """``(B,)`` whether a stream starts anew at this update."""
         ...
@@ -127,7 +132,10 @@ class PixelTask:
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
         t_history = torch.rand(whole[0], frames, generator=source)[slots]
         flow_frame, top, left = int(rng.integers(frames)), *(int(rng.integers(_corners(side))) for side in render.shape[2:4])
-        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history, got.references)
+        users = got.road_users.permute(0, 1, 3, 4, 2).contiguous()
+        sample = PixelSample(
+            render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history, got.references, users
+        )
         return NoisyBatch(sample, got.fresh)
 
     def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:

@@ -13,8 +13,8 @@ from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, find_leader, idm_acceleration
 from alpasim_plugin.world.path import Path
+from policies.base import follow, make_path
 from policies.learned_net import KNOTS_M, TIMES_S, path_grid
-from policies.paths import follow, make_path
 from scenarios.expert import ExpertStyle, speed_limits
 
 STEP_S = 0.1

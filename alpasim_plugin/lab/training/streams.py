@@ -19,10 +19,17 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, I64, U8
+from alpasim_plugin.core.types import F32, I64, U8, Bool
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.lab.training.drive_pairs import DRIVE
-from alpasim_plugin.lab.training.episode_references import ReferenceDraw, draw_references, pair_references, smooth_field, video_references
+from alpasim_plugin.lab.training.episode_references import (
+    ReferenceDraw,
+    draw_references,
+    pair_references,
+    road_users,
+    smooth_field,
+    video_references,
+)
 from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
 from alpasim_plugin.lab.training.map_errors import MapError, draw_map_error, with_error
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
@@ -34,7 +41,7 @@ SIDE = 16  # crops are multiples of it
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
 P_BETTER, BETTER = 0.15, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
-P_DRIVE = 0.4  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
+P_DRIVE = 0.3  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
 P_GREY = 0.06  # recordings without colour
 # A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
 # render is the truth, moved by a smooth field; where it doubles, the mean of two.
@@ -82,6 +89,7 @@ class StreamBatch:
         kind: ``(B,)`` int64, index into `KINDS`.
         references: ``(B, T, K, h, w, 4)`` recorded frames in the view, colour in [-1, 1] and where they hold, 0 to 1; all 0 where there is
             none.
+        road_users: ``(B, T, 1, h, w)`` bool; what shows a road user's box.
     """
 
     render: Tensor
@@ -91,6 +99,7 @@ class StreamBatch:
     fresh: Tensor
     kind: Tensor
     references: Tensor
+    road_users: Tensor
 
 
 @dataclass(frozen=True)
@@ -185,9 +194,9 @@ class TrainingStreams:
         """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""
         slots = [self.episode_of(slot, i) for slot in range(self.batch)[some]]
         shown = [self._show(episode, at) for episode, at in slots]
-        render, opacity, sdmap, target, references = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
+        render, opacity, sdmap, target, references, users = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
         fresh = torch.tensor([at == 0 or i == 0 for _, at in slots])
-        return StreamBatch(render, opacity, sdmap, target, fresh, torch.tensor([episode.kind for episode, _ in slots]), references)
+        return StreamBatch(render, opacity, sdmap, target, fresh, torch.tensor([episode.kind for episode, _ in slots]), references, users)
 
     def episode_of(self, slot: int, i: int) -> tuple[Episode, int]:
         """Return what a slot shows at update ``i``, and how many updates of the episode came before."""
@@ -234,8 +243,8 @@ class TrainingStreams:
             moved_px, doubled, without_colour, map_error, elsewhere,
         )  # fmt: skip
 
-    def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32]:
-        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target and references of an episode's update."""
+    def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32, Bool]:
+        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target, references and road users of an episode's update."""
         clip, kind = episode.sequence.clip, KINDS[episode.kind]
         index = there_and_back(episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip))
         columns = slice(episode.left, episode.left + self.crop[1])
@@ -266,7 +275,10 @@ class TrainingStreams:
             render, target, references[..., :3] = _grey(render, 1), _grey(target, 1), _grey(references[..., :3], -1)
         other = episode.other.clip.sdmap if episode.map_error.kind == "other" else clip.sdmap
         sdmap = other if other.shape == clip.sdmap.shape else clip.sdmap
-        return render, opacity, self._map(with_error(cut(sdmap), episode.map_error), episode), target, references
+        users = road_users(episode.sequence, index, rows, columns)[:, None]
+        if episode.flip:
+            users = users[..., ::-1].copy()
+        return render, opacity, self._map(with_error(cut(sdmap), episode.map_error), episode), target, references, users
 
     def _map(self, sdmap: U8, episode: Episode) -> F32:
         shown = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.io.reading.arrays import read_metadata
 from alpasim_plugin.nets.checkpoints import load_weights, weight
-from alpasim_plugin.nets.headers import read_metadata
 
 NAME = "perceptual-syn"
 FORMAT = "simrun-perceptual-1"

@@ -1,11 +1,10 @@
 """Parts by name: what can be named, what a name stands for, and what identifies it.
 
 A name is resolved once, into a `PartSpec` that carries the part's identity; a worker process only builds it. Built-in parts
-(`alpasim_plugin.plugins.parts.builtin`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
+(`alpasim_plugin.plugins.parts.spec`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
 """
 
 from alpasim_plugin.plugins.interfaces import complete
-from alpasim_plugin.plugins.parts.build import build
 from alpasim_plugin.plugins.parts.resolve import (
     RendererSpec,
     find,
@@ -17,7 +16,7 @@ from alpasim_plugin.plugins.parts.resolve import (
     split_settings,
     unidentified,
 )
-from alpasim_plugin.plugins.parts.spec import PartSpec, digest
+from alpasim_plugin.plugins.parts.spec import PartSpec, build, digest
 
 __all__ = [
     "PartSpec",

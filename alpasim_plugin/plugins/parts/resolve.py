@@ -14,14 +14,12 @@ from typing import Any
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.installed import installed, installed_names
+from alpasim_plugin.core.lazy import installed, installed_names
 from alpasim_plugin.io.config import apply_overrides, validate
 from alpasim_plugin.io.yaml_positions import Document
 from alpasim_plugin.plugins.interfaces import Declaration
-from alpasim_plugin.plugins.parts.builtin import BUILTIN
-from alpasim_plugin.plugins.parts.loading import absolute_target, file_of, is_target, load, require_unedited, split_address
-from alpasim_plugin.plugins.parts.source import code_digest
-from alpasim_plugin.plugins.parts.spec import KINDS, MODES, KindName, PartSpec, digest, file_digest, part_digest
+from alpasim_plugin.plugins.parts.source import absolute_target, code_digest, file_of, is_target, load, require_unedited, split_address
+from alpasim_plugin.plugins.parts.spec import BUILTIN, KINDS, MODES, KindName, PartSpec, digest, file_digest, part_digest
 
 
 @dataclass(frozen=True)

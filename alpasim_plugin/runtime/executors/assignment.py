@@ -24,10 +24,10 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.processes import is_running
 from alpasim_plugin.io import places
 from alpasim_plugin.io.atomic import disk_error, write_bytes
+from alpasim_plugin.io.cache import cached
 from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.plugins.parts import PartSpec
 from alpasim_plugin.plugins.parts.source import OWN_ROOT, code_digest
-from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.run_folder.writer import remove_left_overs
 from alpasim_plugin.runtime.executors.base import Node, Resources, Work
 from alpasim_plugin.runtime.provenance import versions
@@ -250,7 +250,7 @@ def scratch_root() -> Path:
 
 
 def measured_folder(run: str) -> Path | None:
-    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.measured`).
+    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.cache`).
 
     None: nowhere, since the cache cannot be written, or another user could write there and decide what this run takes for its machine's
     speed.

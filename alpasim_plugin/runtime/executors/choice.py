@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import parse_qsl
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.base import Backend, Resources
 
 DOING = "choosing an executor"
+NEEDS: dict[str, Callable[[str], float]] = {"cores": int, "gpus": float, "memory": float}  # memory in GiB
 
 
 @dataclass(frozen=True)
@@ -41,30 +44,38 @@ class Executor:
 LOCAL = Executor()
 
 
-def parse_executor(text: str, cores: int | None = None, gpus: float | None = None, memory_gib: float | None = None) -> Executor:
-    """Parse ``--executor`` and what a worker needs.
+def parse_executor(text: str) -> Executor:
+    """Parse ``--executor``: a place, and behind a question mark what each worker of a cluster needs.
 
     Example:
-        >>> parse_executor("ray:10.0.0.1:6379").where, parse_executor("slurm", cores=4).resources.cores
-        ('10.0.0.1:6379', 4)
+        >>> parse_executor("ray:10.0.0.1:6379").where, parse_executor("slurm?cores=4&gpus=0.5").resources
+        ('10.0.0.1:6379', Resources(cores=4, gpus=0.5, memory_gib=None))
 
     Raises:
-        InputError: There is no such executor, or ``local`` is given resources.
+        InputError: There is no such executor, ``local`` is given needs, or a need is unknown or no number of its kind.
     """
-    kind, _, where = text.partition(":")
-    given = {"--cores": cores, "--gpus": gpus, "--memory": memory_gib}
+    named, _, query = text.partition("?")
+    kind, _, where = named.partition(":")
     if kind == "local" and not where:
-        named = [name for name, value in given.items() if value is not None]
-        if named:
-            found = "local divides this machine's cores among --workers"
-            raise InputError(DOING, f"{named[0]} with --executor local", found, "use --workers, or another executor")
+        if query:
+            do_this = "use --workers, or another executor"
+            raise InputError(DOING, f"--executor {text}", "local divides this machine's cores among --workers", do_this)
         return LOCAL
-    resources = Resources(cores or 1, gpus or 0.0, memory_gib)
     if kind == "ray":
-        return Executor("ray", where, resources)
+        return Executor("ray", where, _resources(text, query))
     if kind == "slurm":
-        return Executor("slurm", where, resources)
+        return Executor("slurm", where, _resources(text, query))
     raise InputError(DOING, f"--executor {text}", "no such executor", "write local, ray, ray:HOST:PORT, slurm, or slurm:PARTITION")
+
+
+def _resources(text: str, query: str) -> Resources:
+    with suppress(KeyError, ValueError):
+        needs = {name: NEEDS[name](value) for name, value in parse_qsl(query, keep_blank_values=True)}
+        cores, gpus, memory = int(needs.get("cores", 1)), needs.get("gpus", 0.0), needs.get("memory")
+        if cores >= 1 and 0 <= gpus < math.inf and (memory is None or 0 < memory < math.inf):
+            return Resources(cores, gpus, memory)
+    do_this = "write for example ray?cores=2&gpus=0.5&memory=7.5: whole cores, a share of a GPU, GiB"
+    raise InputError(DOING, f"--executor {text}", f"{query!r} is not what a worker can need", do_this)
 
 
 @contextmanager

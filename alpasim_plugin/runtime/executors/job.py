@@ -12,9 +12,8 @@ from pathlib import Path
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.atomic import disk_error, scratch_folder
-from alpasim_plugin.io.measured import share_measurements
+from alpasim_plugin.io.cache import cache_root, cached, share_measurements
 from alpasim_plugin.plugins.parts import PartSpec
-from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction import KIND as MODELS
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import failed_manifest, run_cell

@@ -227,7 +227,7 @@ class RayBackend(Backend[J]):
             raise InfrastructureError(DOING, "all of its nodes", f"no node takes the work: {found}", self._do_this)
         if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
             found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
-            raise InfrastructureError(DOING, str(self._given.resources), found, "ask for less (--cores, --gpus, --memory), or add nodes")
+            raise InfrastructureError(DOING, str(self._given.resources), found, "ask for less behind --executor, or add nodes")
         on = {name: sum(one.node == name for one in self._workers.values()) for name in room}
         while len(self._workers) < self._given.workers:
             open_ = [name for name in room if on[name] < room[name] and not self._rests(name, now)]

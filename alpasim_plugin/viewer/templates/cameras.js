@@ -63,6 +63,21 @@ class Camera {
   }
 }
 
+// Tint every cell of a picture: blue as far as it is recorded frames, orange as far as the fixer made it up. The text is that of fixers/trust.py.
+function drawTrust(context, text) {
+  if (!text) return;
+  const [size, digits] = text.split(":"), [columns, rows] = size.split("x").map(Number), { width, height } = context.canvas;
+  const share = (k) => parseInt(digits[k], 16) / 15;
+  for (let k = 0; k < rows * columns; k += 1) {
+    const x = Math.round((k % columns) * width / columns), y = Math.round(Math.floor(k / columns) * height / rows);
+    const w = Math.round(((k % columns) + 1) * width / columns) - x, h = Math.round((Math.floor(k / columns) + 1) * height / rows) - y;
+    for (const [rgb, s] of [["30,110,255", share(2 * k)], ["255,120,0", share(2 * k + 1)]]) {
+      context.fillStyle = `rgba(${rgb},${(0.6 * s).toFixed(3)})`;
+      context.fillRect(x, y, w, h);
+    }
+  }
+}
+
 // The row of cameras: one figure for each renderer of the cell.
 class Cameras {
   constructor(root, index, onFocus, onToggle) {
@@ -74,8 +89,12 @@ class Cameras {
     for (const one of this.shown) if (one.camera) one.camera.stale = true;
   }
 
-  // Draw what belongs over a frame of time t: the plan in force, and on request the map and the road users.
-  over(cell, drive, i, lens, context, t) {
+  hasTrust() { return this.shown.some((one) => one.camera?.frames.trust); }
+
+  // Draw what belongs over a frame of time t: the plan in force, and on request the map and the road users, or where the picture comes from.
+  over(cell, drive, i, frames, context, t) {
+    const { lens } = frames;
+    if (this.layers.has("trust")) { drawTrust(context, frames.trust?.[lastAt(frames.t, t)]); return; }
     if (!lens || !this.layers.size) return;
     const overlay = new Overlay(context, lens, drive.rear), colour = getComputedStyle(document.documentElement).getPropertyValue(`--${variantClass(this.index, drive.renderer)}`).trim();
     overlay.at(heldPose(drive.ego, t));
@@ -118,7 +137,7 @@ class Cameras {
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", "Camera " + frames.name + " behind " + drive.renderer);
       stage.append(canvas);
-      camera = new Camera(canvas, frames, (context, t) => this.over(cell, drive, i, frames.lens, context, t));
+      camera = new Camera(canvas, frames, (context, t) => this.over(cell, drive, i, frames, context, t));
     } else {
       const why = drive.failed ? "Nothing to show. " + drive.failed : drive.no_frames || "No camera frames.";
       stage.append(make("p", "none", why));

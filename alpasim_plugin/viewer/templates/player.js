@@ -3,7 +3,7 @@
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 const POLL_MS = 2000;
-const LAYERS = [["plan", ["plan"]], ["plan and map", ["plan", "samples", "lanes", "recorded", "users"]], ["nothing", []]];
+const LAYERS = [["plan", ["plan"]], ["plan and map", ["plan", "samples", "lanes", "recorded", "users"]], ["where it comes from (blue: recorded, orange: made up)", ["trust"]], ["nothing", []]];
 
 const player = {
   index: JSON.parse(byId("index").textContent),
@@ -208,8 +208,8 @@ const player = {
 
   // What is drawn over the pictures: the plan, all that is known, nothing.
   nextLayers() {
-    this.layers = (LAYERS.findIndex(([name]) => name === byId("over").dataset.name) + 1) % LAYERS.length;
-    const [name, layers] = LAYERS[this.layers];
+    const there = LAYERS.filter(([, [first]]) => first !== "trust" || this.cameras.hasTrust());
+    const [name, layers] = there[(there.findIndex(([name]) => name === byId("over").dataset.name) + 1) % there.length];
     Object.assign(byId("over"), { textContent: `Over the picture: ${name}` }).dataset.name = name;
     this.cameras.setLayers(layers);
     if (this.cell) this.show();

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.gaussians.fit.adjust import adjust, corrected
-from alpasim_plugin.gaussians.fit.balance import balances, gain_between
-from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps
-from alpasim_plugin.gaussians.fit.segment_sky import sky_masks
-from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, follow, place
+from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
+from alpasim_plugin.gaussians.fit.lens import balances, gain_between
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, adjust, corrected, follow, place
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
 

@@ -21,9 +21,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.limits import FILE_BYTES
 from alpasim_plugin.io.reading import exists, read_bytes, read_json, read_json_as, read_json_lines, read_text, tables
 from alpasim_plugin.io.reading.arrays import open_npy, parse_npy
-from alpasim_plugin.io.reading.files import parse_xml
+from alpasim_plugin.io.reading.files import check_names, gunzip, parse_xml, unzstd
 from alpasim_plugin.io.reading.images import decode_image, image_size
-from alpasim_plugin.io.reading.packed import check_names, gunzip, unzstd
 from alpasim_plugin.io.reading.tables import read_parquet
 from tests.fuzz.seen import png_header
 from tests.fuzz.targets import CORE, check, inputs, workplace

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import U8, Actor, Box, RecordedFrame, Trajectory
-from alpasim_plugin.lab.training.episode_references import SLOTS, ReferenceDraw, draw_references, pair_references, video_references
+from alpasim_plugin.lab.training.episode_references import (
+    SLOTS,
+    ReferenceDraw,
+    draw_references,
+    pair_references,
+    road_users,
+    video_references,
+)
 from alpasim_plugin.lab.training.map_errors import CHANCES, MapError, draw_map_error, is_paint, with_error
 from alpasim_plugin.lab.training.pair_store import PairSequence, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
@@ -37,7 +44,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> PairSequence:
     def beside(partial: Path) -> None:
         write_references(partial, [FrameGeometry(wall, {})] * FRAMES, [recorded(i) for i in range(3)], [car])
 
-    write_sequence(folder, (pair(i) for i in range(FRAMES)), FRAMES, {"camera": {"K": K}}, beside)
+    write_sequence(folder, (pair(i) for i in range(FRAMES)), FRAMES, {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}}, beside)
     return PairSequence(folder)
 
 
@@ -50,6 +57,26 @@ def test_a_crop_has_the_references_of_the_whole_frame_cut_to_it(sequence: PairSe
     whole, part = shown(sequence, EXACT), shown(sequence, EXACT, rows, columns)
     assert part.shape == (3, SLOTS, 16, 32, 4)
     assert np.abs(whole[:, :, rows, columns].astype(int) - part).max() <= 1
+
+
+def test_road_users_are_where_their_boxes_are(tmp_path: Path) -> None:
+    """A car of 4 x 2 x 1.5 m stands 10 m ahead of the camera in the first frame alone."""
+    wall, T_world_box = np.full((HEIGHT, WIDTH), 10, np.float16), np.eye(4)
+    T_world_box[2, 3] = 10.0
+    frames = [FrameGeometry(wall, {"car": T_world_box} if i == 0 else {}) for i in range(FRAMES)]
+    car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
+    recorded = [RecordedFrame(0, "front", np.array(K), np.eye(4), {}, lambda: (pair(0).rgb_gt, wall.astype(np.float32)))]
+    info = {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}}
+    write_sequence(tmp_path / "a", (pair(i) for i in range(FRAMES)), FRAMES, info, lambda to: write_references(to, frames, recorded, [car]))
+    whole = road_users(PairSequence(tmp_path / "a"), np.array([0, 1]), slice(0, HEIGHT), slice(0, WIDTH))
+    part = road_users(PairSequence(tmp_path / "a"), np.array([0]), slice(8, 24), slice(16, 48))
+    assert whole[0].any()
+    assert not whole[0].all()
+    assert not whole[1].any()
+    assert np.array_equal(part[0], whole[0, 8:24, 16:48])
+    without = road_users(make(tmp_path / "b"), np.array([0]), slice(0, 16), slice(0, 16))
+    assert without.shape == (1, 16, 16)
+    assert not without.any()
 
 
 def test_as_many_references_as_drawn_and_none_without_a_recording(sequence: PairSequence, tmp_path: Path) -> None:

@@ -13,13 +13,12 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.grid_term import grid_term
-from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, choice_term, pixel_losses
+from alpasim_plugin.lab.training.pixel_rollout import ROAD_USER, PixelObjectives, PixelSample, choice_term, pixel_losses
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
-from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, pixel_source
 from alpasim_plugin.nets.reference_blend import Sources, mix
 
 SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
@@ -35,6 +34,7 @@ class Batch:
     map: Tensor
     target: Tensor
     fresh: Tensor
+    road_users: Tensor
     references: Tensor | None = None
 
 
@@ -47,7 +47,8 @@ class Streams:
         source = torch.Generator().manual_seed(i)
         target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
         opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
-        whole = Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]))
+        users = torch.rand(opacity.shape, generator=source) < 0.1
+        whole = Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]), users)
         return Batch(*(getattr(whole, field.name)[slots] for field in fields(whole) if field.name != "references"))
 
     def facts(self) -> dict[str, Any]:
@@ -100,6 +101,22 @@ def test_terms_are_what_they_are_called() -> None:
     total = found.picture + 0.1 * found.perceptual + 0.25 * found.temporal + 0.25 * found.flow + 0.01 * found.grid
     torch.testing.assert_close(found.total, total)
     assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
+
+
+def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays() -> None:
+    net, s = generator(), sample()
+    start = net.start(s.render[:, 0])
+    users = torch.zeros_like(s.opacity, dtype=torch.bool)
+    users[:, :, 4:8, 8:16] = True
+    plain, found = (pixel_losses(net, replace(s, road_users=which), start, PixelObjectives(0, 1, 0), None) for which in (None, users))
+    error = (found.predictions - s.truth).abs()
+    inside, all_of_them = error[:, :, 4:8, 8:16].mean(), error.mean()
+    share = users.float().mean()
+    expected = (all_of_them + (ROAD_USER - 1) * share * inside) / (1 + (ROAD_USER - 1) * share)
+    torch.testing.assert_close(found.picture, expected)
+    assert not torch.allclose(found.temporal, plain.temporal)
+    everywhere = pixel_losses(net, replace(s, road_users=torch.ones_like(users)), start, PixelObjectives(0, 1, 0), None)
+    torch.testing.assert_close(everywhere.picture, plain.picture)
 
 
 @pytest.mark.parametrize(("horizon", "reaches"), [(1, 0), (2, 0), (3, 2), (4, 2)])

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.renderers.cache import cached
+from alpasim_plugin.io.cache import cached
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +82,7 @@ def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache: 
         """
         import sys, time
         from pathlib import Path
-        from alpasim_plugin.renderers.cache import cached
+        from alpasim_plugin.io.cache import cached
 
         def make(folder):
             time.sleep(0.4)

@@ -1,11 +1,11 @@
-"""Compile the ``.proto`` files beside this one. Generated modules are checked in: no installation needs a compiler.
+"""Compile the ``.proto`` files of `alpasim_plugin.wire.protos`. Generated modules are checked in: no installation needs a compiler.
 
 The generator is the oldest that writes code for Python 3.11; what it writes loads under protobuf 4.25 up to 6. It cannot be installed
 beside a newer protobuf, so it gets an environment of its own::
 
     python3.11 -m venv /tmp/protoc
     /tmp/protoc/bin/pip install grpcio-tools==1.62.3 "setuptools<81"
-    /tmp/protoc/bin/python alpasim_plugin/wire/protos/compile.py
+    /tmp/protoc/bin/python tests/alpasim/compile_protos.py
 
 With a folder as argument the modules are written there instead. ``checksums.json`` holds the digests of sources and results, so that a
 test without the compiler sees a forgotten run.
@@ -21,7 +21,7 @@ import tempfile
 from importlib import metadata
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
+PROTOS = Path(__file__).resolve().parents[2] / "alpasim_plugin" / "wire" / "protos"
 GENERATOR = "1.62.3"
 IMPORTS = "simrun/wire"  # how the files import each other; also their names in protobuf's descriptor pool
 CHECKSUMS = "checksums.json"
@@ -41,7 +41,7 @@ def compile_protos(target: Path) -> list[str]:
     """
     from grpc_tools import protoc
 
-    sources = sorted(HERE.glob("*.proto"))
+    sources = sorted(PROTOS.glob("*.proto"))
     with tempfile.TemporaryDirectory() as scratch:
         root = Path(scratch)
         inside = root / IMPORTS
@@ -55,7 +55,7 @@ def compile_protos(target: Path) -> list[str]:
             text = re.sub(rf"^from {IMPORTS.replace('/', '[.]')} import", "from . import", made.read_text(), flags=re.MULTILINE)
             (target / made.name).write_text(text)
     for source in sources:
-        if target != HERE:
+        if target != PROTOS:
             (target / source.name).write_bytes(source.read_bytes())
     (target / CHECKSUMS).write_text(json.dumps(digests(target), indent=1) + "\n")
     return sorted(path.name for path in target.glob("*_pb2.py"))
@@ -65,5 +65,5 @@ if __name__ == "__main__":
     found = metadata.version("grpcio-tools")
     if found != GENERATOR:
         raise SystemExit(f"error: grpcio-tools {found}; take {GENERATOR}, as the head of {Path(__file__).name} says")
-    made = compile_protos(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE)
+    made = compile_protos(Path(sys.argv[1]) if len(sys.argv) > 1 else PROTOS)
     print(f"compiled {len(made)} modules with grpcio-tools {found}")

@@ -1,1 +1,0 @@
-"""What `simrun new` writes."""
