@@ -1,7 +1,7 @@
 """Evaluators: a log and a map in, metric series out; then one value per rollout, and tables with intervals over rollouts.
 
 Example:
-    ``series = score(rollout, scene, preset="paper")``; ``reduction = reduce_rollout(series, "paper")``;
+    ``series = score(rollout, scene)``; ``reduction = reduce_rollout(series)``;
     ``row = {"renderer": ..., "policy": ..., "scene": ..., "seed": ..., "status": "ok", **reduction.as_row()}``;
     ``metrics = aggregate(rows)``.
 """

@@ -12,7 +12,7 @@ import shapely
 
 from alpasim_plugin.core.geometry import centre_line
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
+from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint, Signal
 from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
 from scenarios.recorded import SourceFiles
 
@@ -31,6 +31,8 @@ PAINTS: dict[str, Paint] = {
     "no_marking": "none",
     "unknown": "unknown",
 }
+COLOURS = {"red": "red", "redYellow": "red_yellow", "yellow": "yellow", "green": "green", "inactive": "inactive"}
+Cycle = tuple[tuple[tuple[str, int], ...], int]  # phases in microseconds, and when the first begins
 KINDS = {"shoulder": "shoulder", "busLane": "bus", "bicycleLane": "bike", "parking": "parking"}
 NOT_FOR_CARS = ("sidewalk", "crosswalk")
 MAX_SPEED_SIGNS = ("274", "R2-1")  # German and US maximum speed; the additional value is in m/s
@@ -47,6 +49,8 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
     if not elements:
         raise files.fail(path, "a map without lanelets", "use a scenario with at least one lanelet")
     signs = _speed_signs(root)
+    lights, light_notes = _traffic_lights(files, path, root)
+    signals: list[Signal] = []
     lanes: dict[str, Lane] = {}
     crosswalks: list[F64] = []
     stop_lines: list[F64] = []
@@ -64,7 +68,13 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
             continue
         if is_left_of(right, left):  # bounds exchanged
             left, right, swapped = right, left, swapped + 1
-        stop_lines += _stop_line(files, where, element, left, right, origin)
+        stop_line = _stop_line(files, where, element, left, right, origin)
+        stop_lines += stop_line
+        waits = stop_line[0] if stop_line else np.stack([left[-1], right[-1]])
+        refs = [str(ref.get("ref")) for ref in (*element.findall("trafficLightRef"), *element.findall("stopLine/trafficLightRef"))]
+        ends = centre_line(left, right)[-2:, :2]
+        heading = float(np.arctan2(*(ends[1] - ends[0])[::-1]))
+        signals += [Signal(waits, heading, *lights[ref]) for ref in dict.fromkeys(refs) if ref in lights]
         beside = {side: n for side in ("left", "right") if (n := element.find(f"adjacent{side.capitalize()}")) is not None}
         same = {side: str(n.get("ref")) for side, n in beside.items() if n.get("drivingDir") == "same"}
         lanes[lane_id] = Lane(
@@ -86,6 +96,7 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
     notes = [f"{n} lanelets of type {t} carry no vehicles and are no lanes" for t, n in sorted(left_out.items())]
     if swapped:
         notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
+    notes += light_notes
     lanes = _mark_intersections(lanes)
     if root.find("lanelet/leftBound/lineMarking") is None and root.find("lanelet/rightBound/lineMarking") is None:
         notes.append("the file has no line markings: the paint of all lane edges is unknown")
@@ -94,7 +105,8 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
     notes.append(
         "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
     )
-    return LaneMap(lanes=lanes, road_edges=edges, crosswalks=tuple(crosswalks), stop_lines=tuple(stop_lines)), tuple(notes)
+    known = tuple(signals) if signals else None
+    return LaneMap(lanes=lanes, road_edges=edges, crosswalks=tuple(crosswalks), stop_lines=tuple(stop_lines), signals=known), tuple(notes)
 
 
 def point(files: SourceFiles, where: str, element: Element) -> tuple[float, float, float]:
@@ -140,6 +152,40 @@ def _stop_line(files: SourceFiles, where: str, element: Element, left: F64, righ
         return []
     points = [point(files, f"{where}, stopLine", p) for p in line.findall("point")]
     return [np.array(points) - origin if len(points) == 2 else np.stack([left[-1], right[-1]])]
+
+
+def _traffic_lights(files: SourceFiles, path: Path, root: Element) -> tuple[dict[str, Cycle], list[str]]:
+    """Return the cycle of each traffic light that is on and holds back all directions, by id (2020a), with a note on the others.
+
+    A cycle begins at its time offset with its first element (Maierhofer and others, CommonRoad documentation of XML 2020a).
+
+    Raises:
+        InputError: A colour that the format does not have, or a duration that is no number of time steps.
+    """
+    step_us = float(str(root.get("timeStepSize"))) * 1e6  # the reader has checked it
+    found: dict[str, Cycle] = {}
+    lights = root.findall("trafficLight")
+    for light in lights:
+        where = f"{path}, trafficLight {light.get('id')}"
+        cycle = light.find("cycle")
+        if cycle is None or light.findtext("active") == "false" or light.findtext("direction") not in (None, "all"):
+            continue
+        phases = []
+        for part in cycle.findall("cycleElement"):
+            colour = COLOURS.get(str(part.findtext("color")))
+            steps = number(files, where, part.find("duration"), "duration")
+            if colour is None or steps <= 0:
+                said = f"color {part.findtext('color')!r}, duration {steps:g}"
+                raise files.fail(where, said, f"use {', '.join(COLOURS)} and durations above 0, in time steps")
+            phases.append((colour, round(steps * step_us)))
+        offset = cycle.find("timeOffset")
+        if phases:
+            found[str(light.get("id"))] = (
+                tuple(phases),
+                0 if offset is None else round(number(files, where, offset, "timeOffset") * step_us),
+            )
+    left_out = len(lights) - len(found)
+    return found, [f"{left_out} traffic lights are off, without a cycle or for some directions only, and are not used"] if left_out else []
 
 
 def _speed_signs(root: Element) -> dict[str, float]:

@@ -21,8 +21,8 @@ from alpasim_plugin.run_folder.schema import slug
 from alpasim_plugin.runtime.decide import Decided, Design, arms_asked, execute_decision, key_of
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan
 from evaluators.opening import read_run
-from evaluators.report.decision import metric_lines, verdict_line
 from evaluators.report.numbers import plural
+from evaluators.report.verdict import metric_lines, verdict_line
 from evaluators.statistics.arms import Arm, arms_of, base_named, usual_base
 from evaluators.statistics.baselines import StoredSide, check_made_alike, read_baseline, rows_of_run, stored_side
 from evaluators.statistics.gate import GateSpec, load_gate

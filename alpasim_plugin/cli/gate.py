@@ -36,9 +36,10 @@ from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.run import Progress, execute_run
+from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
-from evaluators.report.decision import judge_decided
+from evaluators.report.verdict import judge_decided
 from evaluators.statistics.baselines import check_matches, read_baseline, rows_of_run, table_of_run, write_baseline
 from evaluators.statistics.gate import GateSpec, GateVerdict, judge, judge_table, load_gate
 from evaluators.statistics.sequential.question import Question, stopping_note
@@ -104,7 +105,7 @@ def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequ
         progress: Creates a progress display, once for each of the two runs.
     """
     broken = broken_renderers()
-    options = RunOptions(preset=spec.preset or "paper", baseline=REFERENCE)
+    options = RunOptions(preset=spec.preset or DEFAULT, baseline=REFERENCE)
     plan = make_plan(load_suite(SUITE), [REFERENCE, *broken], [POLICY], [SEED], options)
     control = make_plan(load_suite(SUITE), [REFERENCE], [POLICY], [OTHER_SEED], options)
     runs = [(plan, root), (control, root / "control")]
@@ -279,7 +280,7 @@ def print_verdict(verdict: GateVerdict) -> None:
 
 def _self_test(gate_file: str, out: Path | None, workers: int | None, as_json: bool) -> int:
     spec, source = load_gate(gate_file)
-    root = out or Path("runs", f"gate-self-test-{spec.preset or 'paper'}")
+    root = out or Path("runs", f"gate-self-test-{spec.preset or DEFAULT}")
     began = time.perf_counter()
     result = run_self_test(spec, root, workers, ["simrun", *sys.argv[1:]], lambda: make_progress(as_json))
     took_s = time.perf_counter() - began

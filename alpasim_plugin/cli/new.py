@@ -22,14 +22,14 @@ from alpasim_plugin.plugins.parts.source import load
 
 LIST_PARTS_EPILOG = "Example: `simrun list scenarios`"
 
-Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators", "sources", "scenarios", "metrics"]
+Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators", "sources", "scenarios", "metrics", "presets"]
 
 
 def list_parts(
     kind: Annotated[Listed, Positional("What to list.")],
     as_json: Json = False,
 ) -> None:
-    """List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help."""
+    """List renderers, fixers, policies, other parts, shipped scenarios, metrics or presets, one a line with one line of help."""
     tables: dict[str, Callable[[], dict[str, str]]] = {
         "renderers": _renderers,
         "fixers": _fixers,
@@ -39,6 +39,7 @@ def list_parts(
         "sources": lambda: names("source"),
         "scenarios": _scenarios,
         "metrics": _metrics,
+        "presets": _presets,
     }
     known = tables[kind]()
     if as_json:
@@ -69,6 +70,12 @@ def _scenarios() -> dict[str, str]:
     from scenarios.suite import shipped
 
     return shipped()
+
+
+def _presets() -> dict[str, str]:
+    from evaluators.metrics.presets import described
+
+    return described()
 
 
 def _metrics() -> dict[str, str]:

@@ -242,7 +242,7 @@ Examples:
 def score(
     logs: Annotated[tuple[str, ...], Positional("Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes.")],
     scene: Annotated[tuple[str, ...], Flag("The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable.")],
-    preset: Presets = "paper",
+    preset: Presets = presets.DEFAULT,
     settings: Annotated[Path | None, Flag("AlpaSim's eval-config.yaml, with --preset alpasim.")] = None,
     rails: Annotated[bool, Flag("Lanes by their rails, or their centres widened by 1.85 m.", "--rails/--no-rails")] = True,
     evaluators: Evaluators = (),

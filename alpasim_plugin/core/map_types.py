@@ -50,6 +50,29 @@ class Marking:
 
 
 @dataclass(frozen=True)
+class Signal:
+    """A traffic light that repeats one cycle, and the line at which one waits for it."""
+
+    stop: F64  # (2, 3) metres, world: the ends of the line
+    heading_rad: float  # of the traffic that it holds back
+    phases: tuple[tuple[str, int], ...]  # colour and microseconds, one after the other
+    offset_us: int = 0  # when a first phase begins
+
+    def colour_at(self, t_us: int) -> str:
+        """Return the colour at a time.
+
+        >>> Signal(np.zeros((2, 3)), 0.0, (("red", 30), ("green", 20)), offset_us=10).colour_at(5)
+        'green'
+        """
+        left_us = (t_us - self.offset_us) % sum(lasts_us for _, lasts_us in self.phases)
+        for colour, lasts_us in self.phases:
+            if left_us < lasts_us:
+                return colour
+            left_us -= lasts_us
+        raise AssertionError("a time of a cycle is in one of its phases")
+
+
+@dataclass(frozen=True)
 class LaneMap:
     """Vector map of one scene."""
 
@@ -61,6 +84,7 @@ class LaneMap:
     markings: tuple[Marking, ...] = ()
     poles: tuple[F64, ...] = ()  # each (N, 3) polyline
     signs: tuple[tuple[F64, Box], ...] = ()  # (T_world_sign (4, 4), size)
+    signals: tuple[Signal, ...] | None = None  # traffic lights with their states; None: not known, also where there is none
 
 
 @dataclass(frozen=True)

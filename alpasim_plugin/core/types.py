@@ -22,6 +22,7 @@ from alpasim_plugin.core.map_types import LaneMap as LaneMap
 from alpasim_plugin.core.map_types import Marking as Marking
 from alpasim_plugin.core.map_types import Paint as Paint
 from alpasim_plugin.core.map_types import Route as Route
+from alpasim_plugin.core.map_types import Signal as Signal
 from alpasim_plugin.core.metric_types import Aggregation as Aggregation
 from alpasim_plugin.core.metric_types import Direction as Direction
 from alpasim_plugin.core.metric_types import MetricInfo as MetricInfo

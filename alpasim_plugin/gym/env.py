@@ -155,7 +155,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         camera: str | None = None,
         scene_seeds: Sequence[int] = (0,),
         overrides: Sequence[str] = (),
-        preset: Literal["paper", "strict"] = "paper",
+        preset: Literal["paper", "strict"] = "strict",
         reward: Reward = Reward(),
         horizon_us: int = 2_000_000,
         step_us: int = 200_000,

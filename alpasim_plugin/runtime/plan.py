@@ -15,7 +15,7 @@ from alpasim_plugin.plugins.parts.source import COMMAND, own_code_digest
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.run_folder.schema import rollout_folder
 from evaluators import resolve_evaluators
-from evaluators.metrics.presets import preset
+from evaluators.metrics.presets import DEFAULT, preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
@@ -27,7 +27,7 @@ LOOP, SCORING = "alpasim_plugin.runtime.rollout", "alpasim_plugin.runtime.scorin
 class RunOptions:
     """Everything except the cells that determines a run's results."""
 
-    preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = "paper"
+    preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = DEFAULT
     images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = "jpeg"
     video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "none"
     device: Annotated[Literal["cpu", "cuda"], Flag("Where renderers compute.")] = "cpu"

@@ -129,7 +129,7 @@ class MapDraft:
     def finish(self) -> LaneMap:
         """Freeze the map."""
         edges, areas, crosswalks = tuple(self.road_edges), tuple(self.drivable_areas), tuple(self.crosswalks)
-        return LaneMap(dict(self.lanes), edges, areas, crosswalks, tuple(self.stop_lines), tuple(self.markings))
+        return LaneMap(dict(self.lanes), edges, areas, crosswalks, tuple(self.stop_lines), tuple(self.markings), signals=())
 
 
 @dataclass(frozen=True)

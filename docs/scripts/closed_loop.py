@@ -2,9 +2,12 @@
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5:clean+3dgs+onefixer,learned:2] [--seconds 8]
 
+and then ``python docs/scripts/headline.py``, which writes what README.md and docs/results.md say of it.
+
 SCENES is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen ones; RUNS (default:
 runs/closed-loop) keeps the run folders, so a second call continues an interrupted first one. Behind a policy's name stand its number of
-seeds and its renderers, all four by default. A scene whose events need more than ``--seconds`` is driven for as many seconds as it needs.
+seeds and its renderers, all four by default. Scenes are driven as long as they were drawn. With ``--seconds`` they are cut, which the
+headline then says, and a scene whose events need more is driven for as many seconds as it needs.
 """
 
 from __future__ import annotations
@@ -104,8 +107,10 @@ def family(row: dict[str, Any]) -> str:
     return str(row["scene"]).split("-")[-2].replace("_", " ")
 
 
-def duration_us(scenario: Path, seconds: int) -> int:
-    """Return a drive's length: as asked, or the least number of whole seconds in which the scenario's events fit."""
+def duration_us(scenario: Path, seconds: int | None) -> int:
+    """Return a drive's length: as drawn, as asked, or the least number of whole seconds above that in which the scenario's events fit."""
+    if seconds is None:
+        return int(yaml.safe_load(scenario.read_text())["timing"]["duration_us"])
     for longer in range(seconds, SECONDS_MOST):
         try:
             load_scenario(scenario, overrides=[f"timing.duration_us={longer * 1_000_000}"])
@@ -121,16 +126,17 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
     parser.add_argument("--policies", default="learned:5,lane-camera:5")
-    parser.add_argument("--seconds", type=int, default=8)
+    parser.add_argument("--seconds", type=int, help="Cut the drives; whole by default.")
     given = parser.parse_args()
     scenes = [given.scenes / split / f"{name}.yaml" for split, frozen in check_scenes(given.scenes).items() for name in frozen.scenes]
     suite = given.runs / "suite.yaml"
     given.runs.mkdir(parents=True, exist_ok=True)
     entries = [{"path": str(path.resolve()), "set": {"timing.duration_us": duration_us(path, given.seconds)}} for path in scenes]
     suite.write_text(yaml.safe_dump({"version": 1, "scenarios": entries}))
-    longer = [f"`{path.stem}` {of['set']['timing.duration_us'] / 1e6:g} s" for path, of in zip(scenes, entries, strict=True)
-              if of["set"]["timing.duration_us"] != given.seconds * 1_000_000]  # fmt: skip
-    parts = [f"{given.seconds} s each{'; ' + ', '.join(longer) if longer else ''}."]
+    lengths_us = [of["set"]["timing.duration_us"] for of in entries]
+    usual_us = min(lengths_us)
+    longer = [f"`{path.stem}` {us / 1e6:g} s" for path, us in zip(scenes, lengths_us, strict=True) if us != usual_us]
+    parts = [f"{usual_us / 1e6:g} s each{'; ' + ', '.join(longer) if longer else ''}."]
     for name in given.policies.split(","):
         words = name.split(":")
         policy, seeds, renderers = words + ["", "5", "+".join(RENDERERS)][len(words) :]

@@ -1,7 +1,7 @@
-"""How the ego moves, also where nothing is touched: comfort, hard braking, time to collision, distance to who is ahead, wrong way, impact.
+"""How the ego moves, also where nothing is touched: comfort, braking, time to collision, who is ahead, wrong way, red light, impact.
 
 The bounds are nuPlan's (`evaluators.scores.nuplan`), the safe distance is that of responsibility-sensitive safety: Shalev-Shwartz et al.,
-"On a formal model of safe and scalable self-driving cars", definition 1. No source of ours knows the states of traffic lights.
+"On a formal model of safe and scalable self-driving cars", definition 1.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from evaluators.scores.states import EgoStates, Tracks
 
 RESPONSE_S, RSS_ACCEL_MPS2, RSS_BRAKE_MPS2, RSS_MOST_BRAKE_MPS2 = 1.0, 3.5, 4.0, 8.0
 NO_ONE_AHEAD, NO_CONTACT, NO_LANES = "nobody is ahead in the ego's way", "nothing touches the ego", "the map has no lanes"
+NO_STATES = "the states of traffic lights are not known"
 FEW = "the log has three steps or fewer"
 
 
@@ -72,6 +73,7 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
         series("rss_margin_m", t_us, margin_m, np.isfinite(margin_m), NO_ONE_AHEAD),
         series("impact_speed_mps", t_us, impact_mps, np.isfinite(impact_mps), NO_CONTACT),
         series("wrong_way", t_us, against, drive.has_map, NO_LANES),
+        series("red_light", t_us, False if drive.ran_red is None else drive.ran_red, drive.ran_red is not None, NO_STATES),
     ]
 
 

@@ -136,16 +136,46 @@ PRESETS: dict[str, Preset] = {
 }
 
 
+DEFAULT = "strict"  # for verdicts of our own; the others are conventions that are named
+
+# Least and greatest share of contacts, in percent, that fall between two logged instants, in two samples (docs/presets.md).
+UNSEEN = {"100 ms": (2, 5), "200 ms": (3, 14), "500 ms": (8, 49)}
+
+
 def contact_note(name: str) -> str:
-    """Say that a preset looks for contact at logged instants only; empty for one that also looks between them, and for unknown ones.
+    """Say what a preset that looks for contact at logged instants only does not see; empty for others, and for unknown ones.
 
     >>> contact_note("strict")
     ''
+    >>> contact_note("paper")[:84]
+    'contact at logged instants only: missed are 2 to 5 % of contacts at steps of 100 ms,'
     """
     chosen = PRESETS.get(name)
     if chosen is None or chosen.contact == "between_steps":
         return ""
-    return "contact at logged instants only: at 100 ms some 2 to 5 % of contacts fall between two; --preset strict looks there too"
+    first, *others = (f"{low} to {high} %{{}} at {{}}{step}" for step, (low, high) in UNSEEN.items())
+    missed = ", ".join([first.format(" of contacts", "steps of "), *(one.format("", "") for one in others)])
+    return f"contact at logged instants only: missed are {missed}; --preset {DEFAULT} looks between them too"
+
+
+HELP = {
+    "paper": "the closed-loop protocol of the OneFixer paper",
+    "strict": "ours, and the default: contact between steps, a signed margin to the edge of the road; needs a map",
+    "nuplan": "nuPlan's closed-loop score",
+    "navsim": "NAVSIM's PDM score and extended PDM score",
+    "hugsim": "HUGSIM's HD-Score",
+    "ncap": "NeuroNCAP's score",
+}
+
+
+def described() -> dict[str, str]:
+    """Return PRESET -> what it is, and what it does not see, the default first."""
+    order = sorted(PRESETS, key=lambda name: name != DEFAULT)
+    return {name: "; ".join(filter(None, (HELP.get(name) or PRESETS[name].reproduces, _unseen(name)))) for name in order}
+
+
+def _unseen(name: str) -> str:
+    return "" if PRESETS[name].protocol else contact_note(name)  # of benchmarks the contacts are those that they define
 
 
 def preset(name: str | Preset) -> Preset:

@@ -15,7 +15,7 @@ from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene
 from alpasim_plugin.plugins.interfaces import Evaluator
 from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
 from alpasim_plugin.plugins.parts.spec import BUILTIN
-from evaluators.metrics.presets import Preset
+from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.table import METRICS, MetricTable, table_of
 
@@ -41,7 +41,7 @@ def resolve_plugins() -> tuple[PartSpec, ...]:
 
 
 def score(
-    rollout: RolloutLog, scene: Scene, preset: str | Preset = "paper", evaluators: Sequence[PartSpec] | None = None
+    rollout: RolloutLog, scene: Scene, preset: str | Preset = DEFAULT, evaluators: Sequence[PartSpec] | None = None
 ) -> list[MetricSeries]:
     """Score one rollout.
 

@@ -318,6 +318,10 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
         "the ego has driven 2 m against its lanes within the last second", label="wrong way", reference=CENTRE, invalid=_NO_LANES,
         formula="metres against the best agreeing lane under `c` within 1 s are 2 or more",
     ),
+    "red_light": _flag(
+        "the ego has passed the line of a traffic light that is red", label="red light", reference=FOOTPRINT, invalid="no states are known",
+        formula="the middle of the front of `F` passes a stop line in the direction of its lane while its light is red, or red and yellow",
+    ),
     "dist_to_gt_location": _metres(
         "distance of the ego centre from where the recording is at that time", "lower", "max", margin=0.5, reference=CENTRE,
         formula="distance from `c` to `p(t)`", invalid=_UNCOVERED,

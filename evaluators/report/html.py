@@ -5,35 +5,38 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_text
-from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.limits import SOURCE_BYTES
+from alpasim_plugin.io.reading import parsing, read_bytes
+from alpasim_plugin.io.reading.images import decode_image
 from alpasim_plugin.run_folder.reader import reporting
-from alpasim_plugin.run_folder.rows import Series
-from alpasim_plugin.run_folder.schema import AGAIN, DOING, WHY_NAME
-from evaluators.metrics.outcomes import has_ended, outcomes_of
+from alpasim_plugin.run_folder.rows import Rollout, Series
+from alpasim_plugin.run_folder.schema import AGAIN, DOING, STRIP_NAME, WHY_NAME
+from evaluators.metrics.outcomes import OUTCOMES, has_ended, in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.charts import drift_charts, forest, speed_against_error
-from evaluators.report.decision import section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
-from evaluators.report.gate import gate_section
 from evaluators.report.headline import find
-from evaluators.report.numbers import DASH, duration, plural
+from evaluators.report.numbers import DASH, duration, fixed, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
 from evaluators.report.rollouts import read_series, rollout_block
-from evaluators.report.shots import shots
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
+from evaluators.report.verdict import decision_section, gate_section
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
@@ -43,6 +46,10 @@ LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
+SHOTS = 3
+USUAL_FRAME = 2  # of a strip, where nothing happened
+SHOT_WIDTH_PX = 420
+DOING_SHOT = "reading a picture of a run"
 NO_REPLAYS: Mapping[FlipKey, str] = {}
 
 
@@ -117,7 +124,7 @@ def context(run: Run) -> dict[str, Any]:
         "when": _when(run.info.get("started_at")),
         "finding": find(run),
         "shots": shots(run, interesting),
-        "decision": section(run),
+        "decision": decision_section(run),
         "gate": gate_section(run),
         "facts": _facts(run),
         "columns": tables.columns(run),
@@ -236,3 +243,65 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("preset", str(run.summary.get("preset") or run.info.get("preset") or DASH)),
     ]
     return [*facts, ("wall time", duration(float(wall)))] if isinstance(wall, int | float) else facts
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture at the head of the report.
+
+    Attributes:
+        said: How the drive ended, and when.
+        src: data: address.
+        link: Where the drive is shown.
+    """
+
+    arm: str
+    scene: str
+    said: str
+    src: str
+    link: str | None
+
+
+def shots(run: Run, interesting: Sequence[str]) -> list[Shot]:
+    """Pick at most three pictures: of drives that failed, one an arm first; else of the arms in the most telling scene.
+
+    Args:
+        run: The run.
+        interesting: Its scenes, the most telling first.
+    """
+    rank = {scene: i for i, scene in enumerate(interesting)}
+    order = list(OUTCOMES)
+    done = [one for one in run.rollouts if one.ok]
+    failed = sorted((one for one in done if outcomes_of(one)), key=lambda r: (min(order.index(o) for o in outcomes_of(r)), rank[r.scene]))
+    firsts = {one.variant: one for one in reversed(failed)}.values()
+    rest = [one for one in done if interesting and one.scene == interesting[0]]
+    found: list[Shot] = []
+    for rollout in dict.fromkeys(one.cell for one in [*list(firsts)[::-1], *failed, *(rest if not failed else [])]):
+        shot = _shot(run, next(one for one in done if one.cell == rollout)) if len(found) < SHOTS else None
+        found += [shot] if shot else []
+    return found
+
+
+def _shot(run: Run, rollout: Rollout) -> Shot | None:
+    path = run.file_of(rollout, STRIP_NAME)
+    manifest = run.manifest(rollout)
+    times = [int(t) for t in manifest.get("strip_t_us") or ()]
+    if path is None or not times:
+        return None
+    events = [event for event in manifest.get("events") or () if event["metric"] in OUTCOMES]
+    first = min(events, key=lambda event: event["t_us"], default=None)
+    k = min(USUAL_FRAME, len(times) - 1)
+    if first is not None:
+        k = min(range(len(times)), key=lambda i: abs(times[i] - int(first["t_us"])))
+    try:
+        strip = decode_image(read_bytes(path, DOING_SHOT, SOURCE_BYTES), path, DOING_SHOT)
+    except InputError:
+        return None  # the report says elsewhere that the picture is absent
+    width = strip.shape[1] // len(times)
+    picture = strip[:, k * width : (k + 1) * width]
+    picture = cv2.resize(picture, (SHOT_WIDTH_PX, round(picture.shape[0] * SHOT_WIDTH_PX / width)), interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    said = in_words(outcomes_of(rollout)) + (f" at {fixed(float(first['t_s']), 1)}\u00a0s" if first is not None else "")
+    arm = rollout.policy if len(run.renderers) == 1 else rollout.renderer if len(run.policies) == 1 else rollout.variant
+    link = run.href(rollout, WHY_NAME) or run.href(rollout)
+    return Shot(arm, rollout.scene, said, "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(), link) if done else None

@@ -17,6 +17,9 @@ from evaluators.scores.states import states_of
 
 Part = float | str  # a value, or what is missing
 NO_MAP, NO_LIMITS, SHORT = "a map", "the speed limits of the lanes", "more than three instants"
+NO_SIGNALS = "the states of the traffic lights"
+RED = ("red", "red_yellow")
+LEVEL_M = 3.0  # a line farther above or below the middle of the ego belongs to another road
 
 
 class Judged:
@@ -28,6 +31,7 @@ class Judged:
         self._lanes = list(scene.lane_map.lanes.values())
         self._xyz = centre.xyz - origin
         self._road = road_of(scene.lane_map, origin, preset) if self._lanes else None
+        self._signals, self._origin = scene.lane_map.signals, origin
         self._looked_for = scene.standing != "unknown"
 
     @property
@@ -108,6 +112,29 @@ class Judged:
     def direction(self) -> Part:
         """Return nuPlan's score of driving with the traffic."""
         return nuplan.direction_score(float(self.against_m.max())) if self.has_map else NO_MAP
+
+    @cached_property
+    def ran_red(self) -> Bool | None:
+        """Where ``(T,)`` the middle of the ego's front passes the line of a traffic light that is red; None where no states are known."""
+        if self._signals is None:
+            return None
+        front, t_us = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading, self.ego.t_us
+        out = np.zeros(len(t_us), dtype=np.bool_)
+        for one in self._signals:
+            start, along = one.stop[0] - self._origin, one.stop[1, :2] - one.stop[0, :2]
+            normal = np.array([-along[1], along[0]])
+            normal *= np.sign(normal @ (np.cos(one.heading_rad), np.sin(one.heading_rad)))
+            beyond = (front - start[:2]) @ normal
+            for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
+                share = beyond[k] / (beyond[k] - beyond[k + 1])
+                aside = (front[k] + share * (front[k + 1] - front[k]) - start[:2]) @ along
+                there = 0.0 <= aside <= along @ along and abs(self._xyz[k, 2] - start[2]) <= LEVEL_M
+                out[k + 1] |= there and one.colour_at(round(float(t_us[k] + share * (t_us[k + 1] - t_us[k])))) in RED
+        return out
+
+    def traffic_lights(self) -> Part:
+        """Return whether no red light is passed."""
+        return NO_SIGNALS if self.ran_red is None else float(not self.ran_red.any())
 
     def speed_limit(self) -> Part:
         """Return nuPlan's score of the speed limit: the highest of the lanes under the ego, where one is known."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alpasim_plugin.core.geometry import offset_trajectory
-from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import F64, I64, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.collision import NOT_LOOKED_FOR, contact_events
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import Preset
@@ -21,10 +21,11 @@ from evaluators.metrics.score import relevant, series, with_preset
 from evaluators.metrics.surface import MARGIN_M
 from evaluators.scores import nuplan
 from evaluators.scores.judged import Judged, Part
-from evaluators.scores.states import states_of
+from evaluators.scores.states import derivative, ego_states, smooth, states_of
 from evaluators.scores.table import MOST, PARTS
 
 Values = Mapping[str, float]
+NO_PAIRS = "two plans 0.5 s apart that reach 4 s in steps of 0.1 s"
 NO_PATH, NO_PLANS, NOT_DRIVEN = "a recorded path with a length", "a plan of more than three poses", "a step that the policy drove"
 
 
@@ -75,12 +76,47 @@ def _navsim(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajector
         "nc": drive.contact(),
         "dac": drive.drivable(MARGIN_M),
         "ddc": drive.direction(),
-        "tlc": "the states of the traffic lights",
+        "tlc": drive.traffic_lights(),
         "ep": "the progress of PDM-Closed in the same scene",
         "ttc": drive.time_to_collision(),
         "lk": drive.lane_keeping(),
         "hc": drive.comfort(),
-        "ec": "the plans of the step before, as far as 4 s at 10 Hz",
+        "ec": _extended_comfort(rollout, preset, centre),
+    }
+
+
+def _extended_comfort(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> Part:
+    """Return the share of plans that move as the one 0.5 s before meant to, over the 3.5 s that both reach."""
+    plans = [one for one in rollout.plans if _reaches(one)]
+    now_us, origin = np.array([one.now_us for one in plans], dtype=np.int64), origin_of(rollout.ego_log, preset)
+    alike = []
+    for plan in plans:
+        k = int(np.searchsorted(now_us, plan.now_us - APART_US, "right")) - 1
+        t_us = plan.now_us + np.arange(0, REACH_US - APART_US + 1, PLAN_STEP_US)
+        if plan.now_us < centre.t_us[0] or k < 0 or plans[k].trajectory.t_us[-1] < t_us[-1]:
+            continue
+        first, second = (_planned_motion(rollout, preset, one.trajectory, t_us, origin) for one in (plans[k], plan))
+        alike.append(all(np.sqrt(np.mean((first[name] - second[name]) ** 2)) <= most for name, most in EXTENDED_COMFORT.items()))
+    return float(np.mean(alike)) if alike else NO_PAIRS
+
+
+def _reaches(plan: LoggedPlan) -> bool:
+    """Tell whether a plan reaches far enough, in steps that are short enough for accelerations."""
+    t_us = plan.trajectory.t_us
+    return len(t_us) > 1 and t_us[-1] >= plan.now_us + REACH_US and int(np.diff(t_us).max()) <= PLAN_STEP_US
+
+
+def _planned_motion(rollout: RolloutLog, preset: Preset, rig: Trajectory, t_us: I64, origin: F64) -> Mapping[str, F64]:
+    """Return acceleration, jerk, yaw rate and yaw acceleration ``(T,)`` of a plan at some of its times."""
+    states = ego_states(rollout, preset, rig, origin)
+    at = rig.t_us.astype(np.float64)
+    accel = smooth(np.interp(t_us, at, np.hypot(*states.accel.T)))
+    yaw = np.interp(t_us, at, states.yaw)
+    return {
+        "accel": accel,
+        "jerk": derivative(accel, t_us, window=15),
+        "yaw_rate": derivative(yaw, t_us),
+        "yaw_accel": derivative(yaw, t_us, times=2),
     }
 
 
@@ -89,6 +125,8 @@ def _weighted(values: Values, weights: Values) -> float:
 
 
 PDMS = {"ep": 5.0, "ttc": 5.0, "hc": 2.0}
+EXTENDED_COMFORT = {"accel": 0.7, "jerk": 0.5, "yaw_rate": 0.1, "yaw_accel": 0.1}  # root mean squares: m/s2, m/s3, rad/s, rad/s2
+APART_US, REACH_US, PLAN_STEP_US = 500_000, 4_000_000, 100_000
 EPDMS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0, "ec": 2.0}
 
 
@@ -173,6 +211,11 @@ def _bounds(parts: Mapping[str, Part], rule: Callable[[Values], float], most: fl
     return rule(low), rule(high)
 
 
+def _matters(parts: Mapping[str, Part], name: str, rule: Callable[[Values], float], most: float) -> bool:
+    """Tell whether a score reads a part: it is lower without it where all that is missing has full marks."""
+    return _bounds(dict(parts) | {name: 0.0}, rule, most)[1] < _bounds(parts, rule, most)[1]
+
+
 def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the parts and scores of the preset's benchmark, the same at every step; nothing by presets that are none's."""
     if preset.protocol is None:
@@ -185,9 +228,11 @@ def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
         parts = dict.fromkeys(PARTS[preset.protocol], NOT_DRIVEN)
     out: dict[str, Part] = {}
     for score, rule in protocol.scores.items():
-        low, high = _bounds(parts, rule, MOST.get(preset.protocol, 1.0))
-        read = [part for name, part in parts.items() if not name.endswith("_mps")]
-        missing = "; ".join(dict.fromkeys(part for part in read if isinstance(part, str)))
+        most = MOST.get(preset.protocol, 1.0)
+        low, high = _bounds(parts, rule, most)
+        missing = "; ".join(
+            dict.fromkeys(part for name, part in parts.items() if isinstance(part, str) and _matters(parts, name, rule, most))
+        )
         out |= {score: low if low == high else missing, f"{score}_least": low, f"{score}_most": high}
     t_us = rollout.ego.t_us
     return [

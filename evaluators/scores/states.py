@@ -100,19 +100,24 @@ class Tracks:
         return Footprints(self.xy[actor, step] + after_s * self.velocity[actor, step], self.yaw[actor, step], self.size[actor])
 
 
+def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F64) -> EgoStates:
+    """Return the states of a trajectory of the rig, driven or planned; positions are relative to an origin ``(3,)``."""
+    t_us = rear.t_us
+    yaw, rear_xy = np.unwrap(yaw_from_quat(rear.quat)), rear.xyz[:, :2] - origin[:2]
+    velocity = in_axes(_rate(rear_xy, t_us), yaw)
+    # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
+    turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
+    size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
+    return EgoStates(t_us, rear_xy, yaw, velocity, _rate(velocity, t_us) + turn, size, float(rollout.T_rig_box[0, 3]))
+
+
 def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory, origin: F64) -> tuple[EgoStates, Tracks]:
     """Return the states of a trajectory of the ego's box centre, driven or planned, and the others as the log has them at its times.
 
     Positions are relative to an origin ``(3,)``.
     """
     t_us = centre.t_us
-    rear = offset_trajectory(centre, inverse(rollout.T_rig_box))
-    yaw, rear_xy = np.unwrap(yaw_from_quat(centre.quat)), rear.xyz[:, :2] - origin[:2]
-    velocity = in_axes(_rate(rear_xy, t_us), yaw)
-    # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
-    turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
-    size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
-    ego = EgoStates(t_us, rear_xy, yaw, velocity, _rate(velocity, t_us) + turn, size, float(rollout.T_rig_box[0, 3]))
+    ego = ego_states(rollout, preset, offset_trajectory(centre, inverse(rollout.T_rig_box)), origin)
     table = ActorTable(rollout, preset, origin)
     at = table.at(t_us)
     actor, step = np.nonzero(at.present)

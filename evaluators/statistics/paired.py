@@ -125,9 +125,9 @@ def compare(
 
     Returns:
         ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
-        and its ``method``; ``guarded`` (the bounds that non-inferior must hold for, or None: `difference_bounds`); ``p_value`` and
-        ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference`` (better,
-        worse, none shown; independent of the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
+        and its ``method``; ``guarded`` (the bounds that non-inferior, and of rates and shares worse, must hold for, or None:
+        `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference``
+        (better, worse, none shown; independent of the margin); ``more_scenes`` (how many would decide an undecided verdict, else None);
         ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
         exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
         independent);
@@ -175,14 +175,17 @@ def compare(
     entry["guarded"], entry["spread"] = guarded, scaled(means)[1] * float(np.std(scaled(means)[0], ddof=1))
     entry["p_value"], entry["test"] = p_value(means, metric.is_flag)
     notes = [interval.note] if interval.note else []
+    shown = _both(interval.bounds, guarded) if np.isfinite(metric.difference_range).all() else interval.bounds
     if len(means) >= LEAST_SCENES:
-        entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, metric.direction, guarded)
+        entry["verdict"] = verdict(shown, entry["p_value"], margin, metric.direction, guarded)
         entry["difference"] = difference(interval.bounds, entry["p_value"], metric.direction)
     else:
         notes.append(f"{len(means)} scenes: a verdict needs at least {LEAST_SCENES}")
+    unseen = f"{len(means)} scenes cannot exclude that a few others are {{}} by up to {reach_of(metric, margin):g} {metric.unit}".rstrip()
     if entry["verdict"] == "undecided" and verdict(interval.bounds, 1.0, margin, metric.direction) == "non-inferior":
-        worst = f"{reach_of(metric, margin):g} {metric.unit}".rstrip()
-        notes.append(f"{len(means)} scenes cannot exclude that a few others are worse by up to {worst}")
+        notes.append(unseen.format("worse"))
+    if entry["verdict"] == "worse" and verdict(_both(interval.bounds, guarded), 0.0, margin, metric.direction) != "worse":
+        notes.append(unseen.format("better"))
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
@@ -216,6 +219,13 @@ def difference_bounds(delta: F64, scenes: I64, metric: MetricInfo, margin: float
     note = f"all {n} scenes are equal, so that they have no spread to go by" if are_alike(means) else ""
     method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
     return Interval(plain.centre, guarded[0], guarded[1], note=note, method=method), guarded
+
+
+def _both(bounds: list[float] | None, guarded: list[float] | None) -> list[float] | None:
+    """Return the bounds that hold both."""
+    if bounds is None or guarded is None:
+        return bounds or guarded
+    return [min(bounds[0], guarded[0]), max(bounds[1], guarded[1])]
 
 
 def flag_interval(delta: F64, scenes: I64) -> Interval:

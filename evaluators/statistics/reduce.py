@@ -15,12 +15,12 @@ import numpy as np
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import F64, I64, Aggregation, Direction, MetricInfo, MetricSeries
 from evaluators.metrics import METRICS
-from evaluators.metrics.presets import Preset
+from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 
 EVENTS = (
     "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane", "left_route", "stalled", "braked_without_cause",
-    "hard_brake", "wrong_way",
+    "hard_brake", "wrong_way", "red_light",
 )  # fmt: skip
 
 NEVER_ENGAGED = "the policy never took over: every step belongs to the warm-up"
@@ -79,7 +79,7 @@ class Reduction:
         return {name: one.as_dict() for name, one in self.values.items()}
 
 
-def rollout_values(series: Sequence[MetricSeries], preset: str | Preset = "paper") -> dict[str, RolloutValue]:
+def rollout_values(series: Sequence[MetricSeries], preset: str | Preset = DEFAULT) -> dict[str, RolloutValue]:
     """Return one value per metric of a rollout, after dropping the steps that do not count.
 
     Args:
@@ -92,7 +92,7 @@ def rollout_values(series: Sequence[MetricSeries], preset: str | Preset = "paper
     return reduce_rollout(series, preset).values
 
 
-def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = "paper") -> Reduction:
+def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAULT) -> Reduction:
     """Reduce a rollout and say what was dropped on the way; see `rollout_values`."""
     chosen = find_preset(preset)
     table = {one.name: one for one in series}

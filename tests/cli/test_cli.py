@@ -11,6 +11,7 @@ import pytest
 from alpasim_plugin.cli.main import main, run_command
 from alpasim_plugin.cli.options import parse_seeds
 from alpasim_plugin.core.errors import InputError
+from evaluators import PRESETS
 
 GOOD = ["--renderer", "clean", "--policy", "log-replay"]
 
@@ -170,6 +171,17 @@ def test_lists_name_every_part_with_help(kind: str, capsys: pytest.CaptureFixtur
     known = json.loads(capsys.readouterr().out)
     assert known
     assert all(known.values()), [name for name, text in known.items() if not text]
+
+
+def test_every_preset_is_listed_with_what_it_is_the_default_first_and_with_the_contacts_that_it_misses(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run_command(["list", "presets", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert next(iter(listed)) == "strict"
+    assert set(listed) == set(PRESETS)
+    assert all(listed.values())
+    assert {name for name, text in listed.items() if "49 % at 500 ms" in text} == {"paper", "alpasim", "alpasim@6f1029c"}
 
 
 def test_doctor_tries_the_parts(capsys: pytest.CaptureFixture[str]) -> None:

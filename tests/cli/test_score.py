@@ -36,7 +36,7 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
     assert run_command(["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["out"], printed["exit_code"], printed["summary"]["preset"]) == (str(out), 0, "paper")
+    assert (printed["out"], printed["exit_code"], printed["summary"]["preset"]) == (str(out), 0, "strict")
     before, after = rows(our_run), rows(out)
     names = [row["rollout"] for row in after]
     assert names == sorted(names)  # session ids, which sort as the seeds
@@ -49,7 +49,7 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     assert set(steps["rollout"].to_pylist()) == set(names)
     for name in ("run.json", "summary.json", "summary.md", "junit.xml", "report.html"):
         assert (out / name).stat().st_size > 0
-    assert json.loads((out / "run.json").read_text())["config"]["preset"]["name"] == "paper"
+    assert json.loads((out / "run.json").read_text())["config"]["preset"]["name"] == "strict"
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
 
 
@@ -82,7 +82,7 @@ def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_pa
     out = tmp_path / "scored"
     command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet", "--no-report"]
     assert run_command(command) == 0
-    assert run_command([*command, "--preset", "strict"]) == 2
+    assert run_command([*command, "--preset", "paper"]) == 2
     assert "holds other results" in capsys.readouterr().err
 
 

@@ -84,7 +84,7 @@ def test_navsim_names_what_is_missing_and_keeps_the_middle_of_the_lane():
     assert found["navsim_lk"] == 0.0
     assert values(rollout(track(CRUISE, np.where(np.arange(N) < 15, 0.6, 0.0))), "navsim")["navsim_lk"] == 1.0
     assert "traffic lights" in found["navsim_epdms"]
-    assert "PDM-Closed" in found["navsim_pdms"]
+    assert found["navsim_pdms"] == "not measured: the progress of PDM-Closed in the same scene"  # it does not read traffic lights
 
 
 def plans(log, length_m, n=3):
@@ -124,6 +124,40 @@ def test_what_a_scene_does_not_know_is_not_measured_and_never_zero():
     assert bare["nuplan_drivable_area"] == bare["nuplan_driving_direction"] == "not measured: a map"
     assert "standing obstacles" in values(log, "nuplan", standing="unknown")["nuplan_no_at_fault_collision"]
     assert values(replace(log, force_gt_us=10**9), "nuplan")["nuplan_score"].startswith("the policy never took over")
+
+
+def replanned(speeds_mps, log=None):
+    """Straight plans of 4.5 s every 0.5 s, each at a speed of its own from where the ego is."""
+    log = log or rollout(track(CRUISE, 0.0))
+    out = []
+    for k, speed in zip(range(0, N - 1, 5), speeds_mps, strict=False):
+        ahead = track(CRUISE[k] + speed * 0.1 * np.arange(46), 0.0, t_us=log.ego.t_us[k] + 100_000 * np.arange(46))
+        out.append(LoggedPlan(int(log.ego.t_us[k]), int(log.ego.t_us[k]), ahead))
+    return replace(log, plans=tuple(out))
+
+
+def test_extended_comfort_is_the_share_of_plans_that_move_as_the_one_half_a_second_before():
+    assert values(replanned([8.0] * 8), "navsim")["navsim_ec"] == 1.0
+    brakes = []
+    for k, one in enumerate(replanned([8.0] * 8).plans):  # every third one would brake with 3 m/s2
+        slower = one.trajectory.xyz.copy()
+        slower[:, 0] -= 1.5 * (0.1 * np.arange(46)) ** 2 * (k % 3 == 2)
+        brakes.append(replace(one, trajectory=replace(one.trajectory, xyz=slower)))
+    log = replace(rollout(track(CRUISE, 0.0)), plans=tuple(brakes))
+    assert values(log, "navsim")["navsim_ec"] == pytest.approx(3 / 7)  # of 7 pairs those after a change are not alike
+    swerve = [replace(one, trajectory=replace(one.trajectory, quat=track(0.0, 0.0, n=46, yaw=0.2 * k * 0.1 * np.arange(46)).quat))
+              for k, one in enumerate(replanned([8.0] * 8).plans)]  # fmt: skip
+    assert values(replace(log, plans=tuple(swerve)), "navsim")["navsim_ec"] == 0.0  # each turns 0.2 rad/s faster
+
+
+def test_plans_that_are_too_short_or_too_coarse_have_no_extended_comfort():
+    short = plans(rollout(track(CRUISE, 0.0)), 16.0)
+    assert "two plans 0.5 s apart" in values(short, "navsim")["navsim_ec"]
+    one = replace(short, plans=replanned([8.0]).plans)
+    assert "two plans 0.5 s apart" in values(one, "navsim")["navsim_ec"]
+    fine = [(p, p.trajectory) for p in replanned([8.0] * 8).plans]
+    every = [replace(p, trajectory=replace(one, t_us=one.t_us[::5], xyz=one.xyz[::5], quat=one.quat[::5])) for p, one in fine]
+    assert "two plans 0.5 s apart" in values(replace(short, plans=tuple(every)), "navsim")["navsim_ec"]
 
 
 def test_every_part_and_score_is_declared():

@@ -41,7 +41,7 @@ def assert_twins_agree(log, preset=PAPER, gap_tol_m=1e-9):
 
 
 def flags(log):
-    found = by_name(score(log, scene(TWO_LANES, log)))
+    found = by_name(score(log, scene(TWO_LANES, log), "paper"))
     return {name: found[f"collision_{name}"].value.tolist() for name in ("any", "front", "rear", "lateral", "at_fault")}
 
 
@@ -112,7 +112,7 @@ def test_the_gap_is_zero_exactly_where_there_is_contact():
 
 def test_without_actors_the_gap_is_invalid_with_a_reason_and_no_flag_is_set():
     log = rollout(track([0.0, 1.0], 0.0))
-    found = by_name(score(log, scene(TWO_LANES, log)))
+    found = by_name(score(log, scene(TWO_LANES, log), "paper"))
     gap = found["min_distance_to_obstacle_m"]
     assert not gap.valid.any()
     assert np.isnan(gap.value).all()
@@ -125,7 +125,7 @@ def test_an_actor_counts_only_between_its_first_and_last_logged_time():
     t = np.array([200_000, 300_000])
     log = rollout(track(0.0, 0.0, n=6), [car("ghost", track(0.0, 0.0, t_us=t))])
     assert flags(log)["any"] == [0, 0, 1, 1, 0, 0]
-    gap = by_name(score(log, scene(TWO_LANES, log)))["min_distance_to_obstacle_m"]
+    gap = by_name(score(log, scene(TWO_LANES, log), "paper"))["min_distance_to_obstacle_m"]
     assert gap.valid.tolist() == [False, False, True, True, False, False]
 
 

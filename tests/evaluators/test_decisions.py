@@ -37,7 +37,8 @@ def test_a_decision_stays_and_intervals_only_shrink_however_often_one_looks():
 @pytest.mark.parametrize(("shift", "answer", "word"), [(0.0, "good", "non-inferior"), (0.5, "bad", "worse")])
 def test_a_metric_without_a_better_side_is_judged_by_the_size_of_the_change(shift, answer, word):
     for sign in (1.0, -1.0):
-        state = state_after(asked(("lateral_bias_m", 0.2)), {"lateral_bias_m": sign * shift + rng(9).normal(0.0, 0.2, 60)}, 60)
+        x = sign * shift + rng(9).normal(0.0, 0.2, 200)  # fewer cannot have shown a scene that is 4 m to one side
+        state = state_after(asked(("lateral_bias_m", 0.2)), {"lateral_bias_m": x}, 200)
         assert (state.answer, state.metrics[0].answer) == (answer, word)
 
 
@@ -106,13 +107,22 @@ def test_questions_without_an_answer_are_refused(make, found):
         make()
 
 
-def test_metres_are_not_non_inferior_by_scenes_that_cannot_have_shown_the_tail():
+@pytest.mark.parametrize(
+    ("metric", "kind", "usual", "tail"),
+    [
+        ("lateral_distance_m", "non-inferior", 0.0, 4.0),
+        ("lateral_bias_m", "non-inferior", 0.0, 4.0),  # either side counts
+        ("lateral_bias_m", "non-inferior", 0.0, -4.0),
+        ("lateral_distance_m", "better", -0.2, 4.0),  # at least 0.1 m better
+    ],
+)
+def test_metres_get_no_good_answer_by_scenes_that_cannot_have_shown_the_tail(metric, kind, usual, tail):
     """2.5 % of scenes are 4 m worse, so that the mean is at the margin: a spread of the other scenes says nothing of them."""
-    question = asked(("lateral_distance_m", 0.1))
+    question = Question((metric_question(metric, 0.1, kind),))
     wrong = 0
     for k in range(30):
-        x = rng(k).normal(0.0, 0.05, 60) + np.where(rng(1000 + k).random(60) < 0.025, 4.0, 0.0)
-        wrong += state_after(question, {"lateral_distance_m": x}, 60).answer == "good"
+        x = usual + rng(k).normal(0.0, 0.05, 60) + np.where(rng(1000 + k).random(60) < 0.025, tail, 0.0)
+        wrong += state_after(question, {metric: x}, 60).answer == "good"
     assert wrong <= 3
-    alike = rng(1).normal(0.0, 0.05, 200)
-    assert state_after(question, {"lateral_distance_m": alike}, 200).answer == "good"
+    alike = 2.0 * usual + rng(1).normal(0.0, 0.05, 200)
+    assert state_after(question, {metric: alike}, 200).answer == "good"

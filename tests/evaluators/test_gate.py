@@ -167,3 +167,17 @@ def test_a_bad_gate_file_is_refused_with_its_line_and_a_hint(tmp_path: Path, tex
 def test_an_unknown_gate_lists_the_shipped_ones():
     with pytest.raises(InputError, match="default"):
         load_gate("nightly")
+
+
+@pytest.mark.parametrize("name", ["default", "policy"])
+def test_a_shipped_gate_lets_a_distance_decide_only_together_with_its_events(name):
+    spec = load_gate(name)[0]
+    assert [metric for metric, rule in spec.metrics.items() if not rule.must_decide] == ["braked_without_cause"]
+    driven = rows(renderer="clean", n_scenes=300) + rows(renderer="3dgs", events=10, n_scenes=300)
+    more = {"lateral_distance_m": 0.1, "lateral_bias_m": 0.0, "progress": 1.0, "collision_at_fault": 0.0, "braked_without_cause": 0.0}
+    run = [row | more for row in driven]
+    plain = spec.model_copy(update={"metrics": {key: rule for key, rule in spec.metrics.items() if rule.margin}})
+    causes = {check.metric: check.cause for check in judge(run, plain).checks}
+    assert causes.pop("offroad") == "undecided"
+    assert set(causes.values()) == {"pass"}
+    assert judge(run, plain).exit_code == 3

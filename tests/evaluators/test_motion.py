@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.types import Signal
 from evaluators import reduce_rollout, score
 from evaluators.metrics.motion import safe_distance_m
 from tests.evaluators.eval_build import TWO_LANES, by_name, car, rollout, scene, track
@@ -52,6 +55,57 @@ def test_driving_against_the_lane_is_the_wrong_way_and_alpasims_preset_has_none_
     assert scored(log)["wrong_way"].value.max() == 1.0
     assert scored(rollout(track(CRUISE, 0.0)))["wrong_way"].value.max() == 0.0
     assert not {"hard_brake", "wrong_way"} & set(scored(log, "alpasim"))
+
+
+def signalled(*phases, offset_us=0, heading_rad=0.0, y=0.0, z=0.0):
+    """Two lanes with a line at x = 30 m, across the right one, and one light over it."""
+    stop = np.array([[30.0, y + 1.75, z], [30.5, y - 1.75, z]])  # not quite square to the lane
+    return replace(TWO_LANES, signals=(Signal(stop, heading_rad, phases, offset_us),))
+
+
+def ran_red(lane_map, y=0.0):
+    log = rollout(track(CRUISE, y))  # 8 m/s; the front is at the line after 3.4 s
+    one = by_name(score(log, scene(lane_map, log), "strict"))["red_light"]
+    navsim = by_name(score(log, scene(lane_map, log), "navsim"))["navsim_tlc"]
+    assert navsim.value.tolist() == [1.0 - one.value.max()] * N
+    return one.value
+
+
+def test_a_red_light_is_passed_where_the_front_crosses_its_line_while_it_is_red():
+    fired = ran_red(signalled(("red", 5_000_000), ("green", 5_000_000)))
+    first = (30.25 - CRUISE[0] - rollout(track(CRUISE, 0.0)).ego_box.length_m / 2) / 8.0
+    assert np.flatnonzero(fired).tolist() == [int(np.ceil(first * 10))]
+
+
+@pytest.mark.parametrize(
+    "lane_map",
+    [
+        signalled(("green", 5_000_000), ("red", 5_000_000)),
+        signalled(("yellow", 10_000_000)),
+        signalled(("red", 3_000_000), ("green", 7_000_000)),  # green when the front comes
+        signalled(("red", 3_000_000), ("green", 7_000_000), offset_us=-10_000_000),
+        signalled(("red", 10_000_000), heading_rad=np.pi),  # for the traffic that comes towards the ego
+        signalled(("red", 10_000_000), y=3.5),  # over the lane beside
+        signalled(("red", 10_000_000), z=6.0),  # on the bridge
+        replace(TWO_LANES, signals=()),
+    ],
+)
+def test_no_red_light_is_passed(lane_map):
+    assert not ran_red(lane_map).any()
+
+
+def test_red_and_yellow_is_red_and_what_is_not_known_is_invalid():
+    assert ran_red(signalled(("red_yellow", 10_000_000))).any()
+    assert ran_red(signalled(("green", 2_000_000), ("red", 8_000_000), offset_us=-2_000_000)).any()
+    unknown = scored(rollout(track(CRUISE, 0.0)))["red_light"]
+    assert not unknown.valid.any()
+    assert unknown.reason == "the states of traffic lights are not known"
+
+
+def test_a_red_light_is_an_event_of_a_drive():
+    log = rollout(track(CRUISE, 0.0))
+    events = reduce_rollout(score(log, scene(signalled(("red", 9_000_000)), log)), "strict").events
+    assert [one["metric"] for one in events] == ["red_light"]
 
 
 def test_one_step_has_no_motion_and_says_so():

@@ -88,7 +88,7 @@ def test_far_beyond_the_edge_nothing_is_touched_and_the_step_counts_as_on_road()
 
 def test_after_the_edge_was_crossed_the_later_steps_do_not_count():
     log = rollout(track(0.0, [0.0, -1.5, -30.0, -60.0]), log=track([0.0, 1.0, 2.0, 3.0], 0.0))
-    values = rollout_values(score(log, scene(TWO_LANES, log)))
+    values = rollout_values(score(log, scene(TWO_LANES, log), "paper"))
     assert values["offroad"].value == 1.0
     assert values["dist_to_gt_trajectory"].value == pytest.approx(1.5)
 
@@ -122,7 +122,7 @@ def test_a_road_edge_of_a_bridge_overhead_does_not_count():
 
 def test_without_lanes_every_road_metric_is_invalid_and_never_zero():
     log = rollout(track([0.0, 1.0], 0.0))
-    found = by_name(score(log, scene(road_map(edges=[edge_line(0.0)]), log)))
+    found = by_name(score(log, scene(road_map(edges=[edge_line(0.0)]), log), "paper"))
     for name in ("offroad", "wrong_lane", "min_distance_to_lane_boundary_m"):
         assert not found[name].valid.any()
         assert np.isnan(found[name].value).all()
@@ -138,19 +138,19 @@ def test_a_road_edge_that_is_needed_but_missing_makes_the_step_invalid():
     found = offroad_of(log, no_edges)
     assert found.valid.tolist() == [True, False, True]
     assert found.reason == "no lane contains the footprint and the map has no road edges to decide"
-    value = rollout_values(score(log, scene(no_edges, log)))["offroad"]
+    value = rollout_values(score(log, scene(no_edges, log), "paper"))["offroad"]
     assert (value.value, value.valid) == (None, False)
     inside = rollout(track(0.0, [0.0, 0.1]))
-    assert rollout_values(score(inside, scene(no_edges, inside)))["offroad"].value == 0.0
+    assert rollout_values(score(inside, scene(no_edges, inside), "paper"))["offroad"].value == 0.0
 
 
 def test_driving_against_the_lane_is_wrong_and_a_shared_junction_is_not():
     log = rollout(track([0.0, -1.0], 0.0, yaw=np.pi))
-    found = by_name(score(log, scene(TWO_LANES, log)))["wrong_lane"]
+    found = by_name(score(log, scene(TWO_LANES, log), "paper"))["wrong_lane"]
     assert found.value.tolist() == [1.0, 1.0]
     back = Lane("back", np.array([[200.0, 0.0, 0.0], [-50.0, 0.0, 0.0]]), None, None)
     shared = road_map(lane("there", 0.0), back)
-    assert by_name(score(log, scene(shared, log)))["wrong_lane"].value.tolist() == [0.0, 0.0]
+    assert by_name(score(log, scene(shared, log), "paper"))["wrong_lane"].value.tolist() == [0.0, 0.0]
     opposing = replace(PAPER, wrong_lane_rule="any_opposes")
     assert by_name(score(log, scene(shared, log), opposing))["wrong_lane"].value.tolist() == [1.0, 1.0]
 
@@ -159,7 +159,7 @@ def test_driving_against_the_lane_is_wrong_and_a_shared_junction_is_not():
 def test_driving_along_minus_x_in_a_lane_along_minus_x_is_right(yaw):
     west = Lane("west", np.array([[100.0, 0.0, 0.0], [-100.0, -1e-9, 0.0]]), None, None)
     log = rollout(track(0.0, 0.0, yaw=yaw))
-    assert by_name(score(log, scene(road_map(west), log)))["wrong_lane"].value.tolist() == [0.0]
+    assert by_name(score(log, scene(road_map(west), log), "paper"))["wrong_lane"].value.tolist() == [0.0]
 
 
 def test_reversed_right_edge_is_repaired_to_its_two_triangles():
@@ -248,7 +248,7 @@ def test_array_evaluation_and_twin_agree_on_hard_roads(lane_map, poses, offset):
     slow = road_by_step(log, where, PAPER)
     fast = offroad_of(log, lane_map)
     assert [None if not ok else bool(v) for v, ok in zip(fast.value, fast.valid, strict=True)] == [one.offroad for one in slow]
-    gap = by_name(score(log, where))["min_distance_to_lane_boundary_m"].value
+    gap = by_name(score(log, where, "paper"))["min_distance_to_lane_boundary_m"].value
     np.testing.assert_allclose(gap, [one.boundary_gap_m for one in slow], atol=1e-9)
     assert (held(log, lane_map).in_one | held(log, lane_map).in_union).tolist() == [one.on_road for one in slow]
 

@@ -158,3 +158,18 @@ def test_a_hundred_thousand_rollouts_are_not_slow_because_of_pairs():
     found = paired(rows, "clean")
     assert time.process_time() - began < 3.0  # about 0.3 s for 20,000 rollouts
     assert found["3dgs"]["offroad"]["n_scenes"] == scenes
+
+
+def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn():
+    def gained(k):
+        return pair([[0.0]] * 20, [[1.0]] * k + [[0.0]] * (20 - k), "offroad", margins={"offroad": 0.05})
+
+    assert [gained(k)["verdict"] for k in (6, 7)] == ["undecided", "worse"]
+    assert gained(6)["ci95"][0] > 0.05 > gained(6)["guarded"][0]
+
+
+def test_worse_in_metres_says_where_few_other_scenes_could_undo_it():
+    base, other = [[float(i)] for i in range(20)], [[i + 0.3 + 0.01 * (i % 3)] for i in range(20)]
+    found = pair(base, other, "lateral_distance_m")
+    assert (found["verdict"], found["note"]) == ("worse", "20 scenes cannot exclude that a few others are better by up to 4 m")
+    assert "note" not in pair(base, [[i + 2.0 + 0.01 * (i % 3)] for i in range(20)], "lateral_distance_m")

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from evaluators.opening import read_run
 from evaluators.report import html
 from evaluators.report.ci import write_gate_files
-from evaluators.report.gate import gate_section
+from evaluators.report.verdict import gate_section
 from evaluators.statistics.baselines import rows_of_run
 from evaluators.statistics.gate import judge, load_gate
 

@@ -361,3 +361,37 @@ def test_reading_twice_gives_the_same_bytes(shared_data):
     assert one.content_hash == two.content_hash
     np.testing.assert_array_equal(one.ego_log.xyz, two.ego_log.xyz)
     assert all((a.track.xyz == b.track.xyz).all() for a, b in zip(one.actors, two.actors, strict=True))
+
+
+# --- traffic lights ---------------------------------------------------------------------------------------------------
+
+
+def light(number, *phases, offset="", more=""):
+    parts = "".join(f"<cycleElement><duration>{lasts}</duration><color>{colour}</color></cycleElement>" for colour, lasts in phases)
+    return f'<trafficLight id="{number}"><cycle>{parts}{offset and f"<timeOffset>{offset}</timeOffset>"}</cycle>{more}</trafficLight>'
+
+
+LIT = lanelet(1, 0, 60, 0, '<successor ref="2"/><trafficLightRef ref="7"/><trafficLightRef ref="8"/>') + lanelet(2, 60, 200, 0)
+
+
+def test_a_light_holds_back_the_lanelet_that_names_it_at_its_end_in_microseconds_of_the_file_s_steps(tmp_path):
+    lights = light(7, ("red", 30), ("redYellow", 5), ("green", 40), offset="10")
+    log = read(tmp_path, lanes=LIT, traffic=obstacle(11, drive(20, 0)), version="2020a", more=lights)
+    (one,) = log.lane_map.signals
+    assert one.stop[:, :2].tolist() == [[40.0, 2.0], [40.0, -2.0]]  # the origin is the first car's place, 20 m
+    assert (one.heading_rad, one.offset_us) == (0.0, 1_000_000)
+    assert one.phases == (("red", 3_000_000), ("red_yellow", 500_000), ("green", 4_000_000))
+    assert [one.colour_at(t) for t in (0, 1_000_000, 4_200_000, 4_500_000, 8_500_000)] == ["green", "red", "red_yellow", "green", "red"]
+
+
+def test_lights_that_are_off_or_for_one_direction_are_noted_and_without_any_nothing_is_known(tmp_path, log):
+    assert log.lane_map.signals is None
+    off = light(7, ("red", 30), more="<active>false</active>") + light(8, ("red", 30), more="<direction>left</direction>")
+    found = read(tmp_path, lanes=LIT, traffic=obstacle(11, drive(20, 0)), version="2020a", more=off)
+    assert found.lane_map.signals is None
+    assert any(note.startswith("2 traffic lights are off") for note in found.notes)
+
+
+@pytest.mark.parametrize("phases", [(("blue", 3),), (("red", 0),), (("red", "soon"),)])
+def test_a_light_with_a_broken_cycle_is_refused(tmp_path, phases):
+    refused(tmp_path, lanes=LIT, version="2020a", more=light(7, *phases))

@@ -1,18 +1,20 @@
-"""Monte-Carlo study of the verdict "non-inferior" with the truth on the margin: how often it is given, which is how often it is wrong.
+"""Monte-Carlo study of verdicts with the truth on the margin: how often each is given, which is how often it is wrong.
 
 ``python -m alpasim_plugin.lab.bench.verdict_study`` prints the tables of docs/experiments/verdicts.md; ``--write PAGE`` puts them between
-the markers of that page. The families are adverse: a few scenes go very wrong, or most get a little better and a few much worse.
+the markers of that page. The families are adverse: a few scenes go very wrong, or most get a little better and a few much worse; for the
+verdict "worse" the other way round. Beside them the worst of many random distributions is looked for.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import scipy
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
@@ -24,6 +26,7 @@ from evaluators.statistics.paired import flag_bounds
 from evaluators.statistics.sequential import betting
 from evaluators.statistics.sequential.draws import independent
 from evaluators.statistics.sequential.line import Plan
+from evaluators.statistics.verdicts import ALPHA
 
 SEEDS = 5
 SCENES = (20, 40, 60, 100, 200, 300)
@@ -136,6 +139,36 @@ def adverse_families() -> list[Family]:
     ]
 
 
+def seldom_better(harm: float, share: float, size: float, noise: float = 0.0) -> Draw:
+    """Return scenes that are all ``harm`` worse, but for a share that is ``size`` better than these."""
+
+    def draw(generator: np.random.Generator, runs: int, scenes: int) -> F64:
+        x = np.where(generator.random((runs, scenes, 1)) < share, harm - size, harm)
+        return np.asarray(x + noise * generator.standard_normal(x.shape))
+
+    return draw
+
+
+def mirrored(draw: Draw, margin: float) -> Draw:
+    """Return harm on the other side of the margin."""
+    return lambda generator, runs, scenes: 2.0 * margin - draw(generator, runs, scenes)
+
+
+def families_against_worse() -> list[Family]:
+    """Return families whose true harm is the margin, and of which many draws look worse."""
+    both = [one for one in adverse_families() if one.is_rate and one.margin == 0.05]
+    metres = partial(Family, margin=0.1, reach=4.0, is_rate=False)
+    return [
+        *both,
+        Family("progress: 10 % far better", seldom_better(0.1, 0.1, 0.5), 0.05, is_rate=False),
+        metres("metres: 2.5 % of scenes better by 4 m", seldom_better(0.2, 0.025, 4.0, 0.05)),
+        metres("metres: 5 % better by 2 m", seldom_better(0.2, 0.05, 2.0, 0.05)),
+        metres("metres: 5 % worse, 2.5 % better by 4 m", jumps(0.05, 4.0, 0.025)),
+        metres("metres: log-normal, sigma 1, its tail better", mirrored(long_tail(0.1, 1.0, 4.0), 0.1)),
+        metres("metres: normal, 0.5 m", mirrored(jumps(0.0, noise=0.5), 0.05)),
+    ]
+
+
 def harmless_families() -> list[Family]:
     """Return families without harm, for the power."""
     return [
@@ -171,26 +204,135 @@ def bet(harm: F64, family: Family) -> F64:
     return np.asarray(betting.log_capital(draws, -family.margin, sizes).max(axis=1) >= plan.log_bar)
 
 
-METHODS: dict[str, Callable[[F64, Family], F64]] = {"spread": by_spread, "betting": bet, "guarded": guarded}
+def hedged(harm: F64, family: Family) -> F64:
+    """Return where ``(runs,)`` a bet that knows no expected difference wins: Waudby-Smith and Ramdas 2024, the predictable plug-in."""
+    x = (np.clip(harm.mean(axis=2), -family.reach, family.reach) + family.reach) / (2.0 * family.reach)
+    at, n = (family.margin + family.reach) / (2.0 * family.reach), x.shape[1]
+    count = np.arange(2, n + 2)
+    mean = (0.5 + np.cumsum(x, axis=1)) / count
+    spread = (0.25 + np.cumsum((x - mean) ** 2, axis=1)) / count
+    before = np.concatenate([np.full((len(x), 1), 0.25), spread[:, :-1]], axis=1)
+    stake = np.minimum(np.sqrt(2.0 * np.log(1.0 / TAIL) / (n * before)), 0.9 / (1.0 - at))
+    return np.asarray(np.cumsum(np.log1p(stake * (at - x)), axis=1).max(axis=1) >= np.log(1.0 / TAIL))
 
 
-def shares(family: Family, scenes: int, repeats: int) -> dict[str, float]:
-    """Return how often each method says "non-inferior"."""
+def bernstein(harm: F64, family: Family) -> F64:
+    """Return where ``(runs,)`` the empirical Bernstein bound of Maurer and Pontil (2009) is below the margin."""
+    x = np.clip(harm.mean(axis=2), -family.reach, family.reach)
+    n, level = x.shape[1], np.log(2.0 / TAIL)
+    error = np.sqrt(2.0 * x.var(axis=1, ddof=1) * level / n) + 14.0 * family.reach * level / (3.0 * (n - 1))
+    return np.asarray(x.mean(axis=1) + error < family.margin)
+
+
+def worse_by_spread(harm: F64, family: Family) -> F64:
+    """Return where ``(runs,)`` what was seen is worse than the margin, and the test of no difference rejects."""
+    means = harm.mean(axis=2)
+    up, down = (means > 0).sum(axis=1), (means < 0).sum(axis=1)
+    p = 2.0 * scipy.special.bdtr(np.minimum(up, down), up + down, 0.5)
+    if family.is_rate:
+        return np.asarray(
+            (flag_bounds(np.maximum(harm, 0.0).mean(axis=2), np.maximum(-harm, 0.0).mean(axis=2))[0] > family.margin) & (p < ALPHA)
+        )
+    alike = np.ptp(means, axis=1) < 1e-12  # the bounds are then the guarded ones
+    low = t_bounds(means)[0]
+    t = (means.mean(axis=1)) / np.where(alike, 1.0, means.std(axis=1, ddof=1) / np.sqrt(means.shape[1]))
+    p = np.where(alike, p, 2.0 * scipy.special.stdtr(means.shape[1] - 1, -np.abs(t)))
+    return np.asarray(np.where(alike, worse_guarded(harm, family), low > family.margin) & (p < ALPHA))
+
+
+def worse_guarded(harm: F64, family: Family) -> F64:
+    """Return where ``(runs,)`` the guarded bound is above the margin."""
+    return guarded(-harm, replace(family, margin=-family.margin))
+
+
+Methods = dict[str, Callable[[F64, Family], F64]]
+METHODS: Methods = {"spread": by_spread, "betting": bet, "guarded": guarded}
+WORSE: Methods = {"spread": worse_by_spread, "guarded": worse_guarded}
+VALID: Methods = {"guarded": guarded, "betting": bet, "hedged": hedged, "Bernstein": bernstein}
+
+
+def shares(family: Family, scenes: int, repeats: int, methods: Methods = METHODS) -> dict[str, float]:
+    """Return how often each method gives its verdict."""
     sizes = [min(BLOCK, repeats - start) for start in range(0, repeats, BLOCK)]
-    found: dict[str, float] = dict.fromkeys(METHODS, 0.0)
+    found: dict[str, float] = dict.fromkeys(methods, 0.0)
     for i, size in enumerate(sizes):
         harm = family.draw(stream(f"{family.name}/{scenes}", 0, "aggregate/study", i), size, scenes)
-        for name, method in METHODS.items():
+        for name, method in methods.items():
             found[name] += float(np.sum(method(harm, family))) / repeats
     return found
 
 
-def table(families: Sequence[Family], scenes: Sequence[int], repeats: int) -> str:
-    """Return a Markdown table with a row for each family, ``spread / betting / guarded`` in percent."""
+def table(families: Sequence[Family], scenes: Sequence[int], repeats: int, methods: Methods = METHODS) -> str:
+    """Return a Markdown table with a row for each family, the methods' shares in percent with slashes between."""
     lines = [f"| family | {' | '.join(f'{n} scenes' for n in scenes)} |", f"| --- |{' --- |' * len(scenes)}"]
     for family in families:
-        cells = [" / ".join(f"{100 * share:.1f}" for share in shares(family, n, repeats).values()) for n in scenes]
+        cells = [" / ".join(f"{100 * share:.1f}" for share in shares(family, n, repeats, methods).values()) for n in scenes]
         lines.append(f"| {family.name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def picked(values: F64, chance: F64) -> Draw:
+    """Return scenes with one of some values each."""
+    return lambda generator, runs, scenes: generator.choice(values, (runs, scenes, 1), p=chance)
+
+
+def random_family(generator: np.random.Generator, margin: float, reach: float) -> Family:
+    """Return three to five values between ``-reach`` and ``reach``, the ends among them more often than not, with the margin as mean."""
+    while True:
+        values = np.where(generator.random(5) < 0.3, generator.choice([-reach, 0.0, reach]), generator.uniform(-reach, reach, 5))
+        values[0] = reach if generator.random() < 0.7 else values[0]
+        values = np.unique(values[: generator.integers(3, 6)])
+        weights = generator.dirichlet(np.full(len(values), 0.3))
+        seen, rest = float(weights[:-1] @ values[:-1]), float(weights[:-1].sum())
+        # The share of the greatest value is what brings the mean to the margin; the others keep their proportions.
+        if rest > 0.0 and seen / rest < margin < values[-1]:
+            top = (margin - seen / rest) / (values[-1] - seen / rest)
+            chance = np.append(weights[:-1] / rest * (1.0 - top), top)
+            return Family("random", picked(values, chance), margin, reach, False)
+
+
+def worst_found(scenes: int, margin: float, reach: float, candidates: int, repeats: int) -> float:
+    """Return the largest share of wrong verdicts by the guarded bound among random distributions; the worst ten are drawn afresh."""
+    generator = stream(f"worst/{scenes}/{margin}", 0, "aggregate/study")
+    families = [random_family(generator, margin, reach) for _ in range(candidates)]
+    first = [float(guarded(one.draw(generator, repeats // 16, scenes), one).mean()) for one in families]
+    return max(float(guarded(families[k].draw(generator, repeats, scenes), families[k]).mean()) for k in np.argsort(first)[-10:])
+
+
+def worst_table(scenes: Sequence[int], candidates: int, repeats: int) -> str:
+    """Return a Markdown table of `worst_found`: rates, metres, and both turned, which is the verdict "worse"."""
+    asked = {"-1 to 1, margin 0.02": (0.02, 1.0), "-1 to 1, margin 0.05": (0.05, 1.0), "-4 to 4, margin 0.1": (0.1, 4.0)}
+    asked |= {f"{name}, worse": (-margin, reach) for name, (margin, reach) in asked.items()}
+    lines = [f"| differences | {' | '.join(f'{n} scenes' for n in scenes)} |", f"| --- |{' --- |' * len(scenes)}"]
+    for name, (margin, reach) in asked.items():
+        cells = [f"{100 * worst_found(n, margin, reach, candidates, repeats):.1f}" for n in scenes]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+POWER, MOST_SCENES = 0.8, 1600
+
+
+def scenes_to_decide(family: Family, method: Callable[[F64, Family], F64], repeats: int) -> int | None:
+    """Return the number of scenes from which on a method says "non-inferior" in 80 % of runs, to 1 %; None where none does."""
+    harm = family.draw(stream(f"{family.name}/needed", 0, "aggregate/study"), repeats, MOST_SCENES)
+    low, high = 2, MOST_SCENES
+    if float(method(harm, family).mean()) < POWER:
+        return None
+    while high - low > max(1, high // 100):
+        middle = (low + high) // 2
+        low, high = (low, middle) if float(method(harm[:, :middle], family).mean()) >= POWER else (middle, high)
+    return high
+
+
+def needed_table(families: Sequence[Family], repeats: int) -> str:
+    """Return a Markdown table of the scenes that each valid method needs, and of the guarded bound's as a share of the best other."""
+    lines = [f"| family | {' | '.join(VALID)} | guarded / best other |", f"| --- |{' --- |' * (len(VALID) + 1)}"]
+    for family in families:
+        found = {name: scenes_to_decide(family, method, repeats) for name, method in VALID.items()}
+        others = [n for name, n in found.items() if n is not None and name != "guarded"]
+        ratio = f"{found['guarded'] / min(others):.2f}" if found["guarded"] and others else "-"
+        lines.append(f"| {family.name} | {' | '.join(str(n or f'over {MOST_SCENES}') for n in found.values())} | {ratio} |")
     return "\n".join(lines) + "\n"
 
 
@@ -202,7 +344,10 @@ def main() -> None:
     options = parser.parse_args()
     made = {
         "wrong": table(adverse_families(), SCENES, options.repeats),
+        "worse": table(families_against_worse(), SCENES, options.repeats, WORSE),
+        "worst": worst_table(SCENES, options.repeats // 5, 8 * options.repeats),
         "power": table(harmless_families(), SCENES_OF_POWER, max(200, options.repeats // 4)),
+        "needed": needed_table(harmless_families(), max(200, options.repeats // 4)),
     }
     if options.write is None:
         print("\n".join(f"{name}\n\n{text}" for name, text in made.items()))

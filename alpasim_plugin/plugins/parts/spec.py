@@ -279,7 +279,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "offroad": ("evaluators.metrics.offroad:FACTORY", "off-road, wrong lane and the distance to the lanes' border"),
         "route": ("evaluators.metrics.route:FACTORY", "distance from the recorded drive, progress and distance driven"),
         "outcomes": ("evaluators.metrics.outcomes:FACTORY", "standstill and braking without a cause, and leaving the route"),
-        "motion": ("evaluators.metrics.motion:FACTORY", "comfort, hard braking, time to collision, safe distance and wrong way"),
+        "motion": ("evaluators.metrics.motion:FACTORY", "comfort, hard braking, time to collision, safe distance, wrong way and red light"),
         "protocols": ("evaluators.scores.protocols:FACTORY", "scores of nuPlan, NAVSIM, HUGSIM and NeuroNCAP"),
         "plan": ("evaluators.metrics.plan:FACTORY", "plan deviation, open-loop collision and minADE of the plans"),
         "image_health": ("evaluators.metrics.image_health:FACTORY", "black and frozen camera images"),

@@ -181,7 +181,7 @@ class _Seen:
     sharing: int  # metrics of which one is enough for the bad answer: its evidence is averaged over them
     first_look: int
     whole: F64 | None = None  # the differences of a suite all of whose scenes are driven: its mean is known
-    guard: Draws | None = None  # the differences cut to `reach_of`: "non-inferior" must hold for these by betting too
+    guard: Draws | None = None  # the differences cut to `reach_of`: the good answer must hold for these by betting too
 
     def paths(self) -> tuple[F64, F64]:
         """Return the log e-processes ``(n,)`` for the good and for the bad answer."""
@@ -195,13 +195,9 @@ class _Seen:
     def _estimated(self) -> tuple[F64, F64]:
         at, mirror = self.question.threshold, self.draws.mirrored()
         if self.question.direction != "none":
-            good = self._above(mirror, -at, 1)
-            if self.guard is not None:
-                bets = betting.bet_sizes(self.guard.mirrored(), -at, self.plan)
-                good = np.minimum(np.maximum.accumulate(good), np.maximum.accumulate(betting.log_capital(self.guard.mirrored(), -at, bets)))
-            return good, self._above(self.draws, at, self.sharing)
+            return self._guarded(mirror, -at), self._above(self.draws, at, self.sharing)
         # A change to either side counts: the size is within the margin if both ends are, and beyond it if either is.
-        below, low_above = self._above(mirror, -at, 1), self._above(self.draws, -at, 1)
+        below, low_above = self._guarded(mirror, -at), self._guarded(self.draws, -at)
         above, low_below = self._above(self.draws, at, 2 * self.sharing), self._above(mirror, at, 2 * self.sharing)
         good = np.minimum(np.maximum.accumulate(below), np.maximum.accumulate(low_above))
         return good, np.logaddexp(above, low_below) - np.log(2.0)
@@ -211,6 +207,15 @@ class _Seen:
             return float(self.whole.mean()), float(self.whole.mean())
         low, high = self._bound(self.draws, 1.0), self._bound(self.draws.mirrored(), -1.0)
         return low, None if high is None else -high
+
+    def _guarded(self, draws: Draws, mean: float) -> F64:
+        """Return the same for the good answer, which must hold for scenes that were not drawn too."""
+        path = self._above(draws, mean, 1)
+        if self.guard is None:
+            return path
+        cut = self.guard if draws is self.draws else self.guard.mirrored()
+        bets = betting.log_capital(cut, mean, betting.bet_sizes(cut, mean, self.plan))
+        return np.minimum(np.maximum.accumulate(path), np.maximum.accumulate(bets))
 
     def _above(self, draws: Draws, mean: float, sharing: int) -> F64:
         """Return the log e-process against "the mean is at most ``mean``", aimed at ``sharing`` / alpha."""
@@ -239,7 +244,7 @@ def _guard(asked: MetricQuestion, x: F64, draws: Draws) -> Draws | None:
     As for the verdicts of `compare`. Only for independent scenes; of a suite whose scenes run out, the mean becomes known.
     """
     reach = reach_of(asked.facts, asked.margin)
-    if asked.method != "asymptotic" or asked.asked != "non-inferior" or not reach or np.any(draws.slope != 1.0):
+    if asked.method != "asymptotic" or not reach or np.any(draws.slope != 1.0):
         return None
     return independent(np.clip(x, -reach, reach), -reach, reach)
 

@@ -5,7 +5,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.lab.bench.verdict_study import Family, adverse_families, harmless_families, jumps, long_tail, shares, table
+from alpasim_plugin.lab.bench.verdict_study import (
+    VALID,
+    WORSE,
+    Family,
+    adverse_families,
+    families_against_worse,
+    guarded,
+    harmless_families,
+    jumps,
+    long_tail,
+    needed_table,
+    random_family,
+    scenes_to_decide,
+    shares,
+    table,
+    worst_found,
+)
+from evaluators.metrics import METRICS
+from evaluators.statistics.paired import paired
+from tests.evaluators.test_tables_over_rollouts import rows_of
 
 RUNS = 400
 MOST = 0.025 + 3 * (0.025 * 0.975 / RUNS) ** 0.5  # three standard errors of the simulation
@@ -47,3 +66,63 @@ def test_the_table_has_a_row_for_each_family() -> None:
     text = table(harmless_families()[:2], (20, 40), 20)
     assert text.startswith("| family | 20 scenes | 40 scenes |\n")
     assert text.count("\n") == 4
+
+
+BENEFITS = {family.name: family for family in families_against_worse()}
+
+
+@pytest.mark.parametrize("name", BENEFITS)
+@pytest.mark.parametrize("scenes", [20, pytest.param(100, marks=pytest.mark.slow), 200])
+def test_worse_by_the_guarded_bound_is_wrong_in_one_run_of_forty_at_most(name: str, scenes: int) -> None:
+    assert shares(BENEFITS[name], scenes, RUNS, WORSE)["guarded"] <= MOST
+
+
+def test_worse_in_metres_by_what_was_seen_is_a_false_alarm_where_few_scenes_are_far_better() -> None:
+    assert shares(BENEFITS["metres: 2.5 % of scenes better by 4 m"], 20, RUNS, WORSE)["spread"] > 0.5
+
+
+def test_the_families_against_worse_stand_on_their_margins() -> None:
+    for family in BENEFITS.values():
+        harm = family.draw(np.random.Generator(np.random.Philox(2)), 40, 2000)
+        assert harm.mean() == pytest.approx(family.margin, rel=0.15), family.name
+
+
+@pytest.mark.parametrize("margin", [0.05, -0.05])
+def test_random_distributions_stand_on_the_margin_and_none_is_wrong_too_often(margin: float) -> None:
+    generator = np.random.Generator(np.random.Philox(5))
+    for _ in range(20):
+        family = random_family(generator, margin, 1.0)
+        harm = family.draw(generator, 50, 2000)
+        assert harm.mean() == pytest.approx(margin, abs=5 * harm.std() / np.sqrt(harm.size))
+        assert np.abs(harm).max() <= 1.0
+    assert worst_found(20, margin, 1.0, 20, 1600) <= 0.025 + 4 * (0.025 * 0.975 / 1600) ** 0.5
+
+
+def test_no_valid_method_needs_many_fewer_scenes_than_the_guarded_bound() -> None:
+    for family in harmless_families():
+        found = {name: scenes_to_decide(family, method, 100) for name, method in VALID.items()}
+        assert found["guarded"] is not None
+        assert found["guarded"] <= 1.2 * min(n for n in found.values() if n is not None), family.name
+    assert needed_table(harmless_families()[:1], 40).splitlines()[-1].startswith("| rates, margin 5 points: no event | 72 | ")
+
+
+@pytest.mark.parametrize(
+    ("name", "metric"),
+    [("rates, margin 5 points: both sides, single seeds", "offroad"), ("metres: 5 % better by 2 m", "lateral_distance_m")],
+)
+def test_a_verdict_is_what_the_study_says_of_the_same_draws(name: str, metric: str) -> None:
+    family = BENEFITS[name]
+    harm = (
+        0.2 + family.draw(np.random.Generator(np.random.Philox(8)), 60, 40)
+        if metric != "offroad"
+        else family.draw(np.random.Generator(np.random.Philox(8)), 60, 40)
+    )
+    for one in harm:
+        base = np.where(one < 0, 1.0, 0.0) if METRICS[metric].is_flag else np.full(one.shape, 10.0)
+        rows = rows_of(base.tolist(), metric, "clean") + rows_of((base + one).tolist(), metric, "3dgs")
+        entry = paired(rows, "clean", margins={metric: family.margin})["3dgs"][metric]
+        says = {word: bool(method(one[None], family)[0]) for word, method in WORSE.items()}
+        worse = says["spread"] and (says["guarded"] or metric != "offroad")
+        assert (entry["verdict"] == "worse") == worse
+        assert ("better by up to" in entry.get("note", "")) == (worse and not says["guarded"])
+        assert (entry["verdict"] != "non-inferior") or bool(guarded(one[None], family)[0])
