@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
-from alpasim_plugin.alpasim.server.costs import Announced, cost_s
+from alpasim_plugin.alpasim.server.frames import Announced, cost_s
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import View, read_view
 from alpasim_plugin.log.images import decode_image

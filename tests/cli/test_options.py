@@ -84,10 +84,11 @@ def test_a_page_of_drives_gets_its_limits(called: Any, monkeypatch: pytest.Monke
 
 def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path) -> None:
     (tmp_path / "token").write_text(" secret \n")
-    bounds = ("--history-mb", "16", "--expiry-s", "60", "--prefetch")
+    bounds = ("--history-mb", "16", "--expiry-s", "60", "--prefetch", "--shutter", "rolling")
     upstream = ("--upstream", f"host:1?ca=ca.pem&token_file={tmp_path / 'token'}&image=as-asked")
     settings = called(serve, "assemble", "serve", *bounds, *upstream)["settings"]
     assert (settings.history_bytes, settings.expiry_s, settings.upstream.as_png) == (16 << 20, 60.0, False)
+    assert settings.shutter == "rolling"
     assert (settings.upstream.token, settings.upstream.ca) == ("secret", Path("ca.pem"))
 
 

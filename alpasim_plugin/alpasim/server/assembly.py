@@ -14,8 +14,7 @@ import grpc
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, resolve_served
-from alpasim_plugin.alpasim.server.costs import Announced
-from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
+from alpasim_plugin.alpasim.server.frames import Announced, Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +15,6 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import FixerCache, size_of
-from alpasim_plugin.alpasim.server.costs import Announced, scaled
 from alpasim_plugin.alpasim.server.history import HistoryTree, Node
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
@@ -28,6 +29,9 @@ ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.J
 NODE_BYTES, OBJECT_BYTES = 4096, 512  # what a frame and each of its objects hold beside pictures and tensors, roughly
 MOST_PIXELS = 2 * MAX_PIXELS  # of all frames of a call: four cameras of 3840 x 2160, which are held until the last is done
 QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
+SHARES = (8, 4)  # of a frame's sides, on which its time is measured: the first is so small that its time is the constant part
+SLOW_S = 0.5  # longer than this per frame is a warning: five times as long as the loop's time between frames
+log = logging.getLogger("simrun.serve")
 
 
 @dataclass(frozen=True)
@@ -183,3 +187,52 @@ def enlarged(image: U8, size: tuple[int, int]) -> U8:
 def encode(image: U8, form: tuple[int, float]) -> bytes:
     """Encode a picture ``(H, W, 3)`` as asked."""
     return encode_image(image, ENCODINGS[form[0]], round(form[1]))
+
+
+def cost_s(make: Callable[[View], object], view: View, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Return the expected seconds of one frame, from two smaller ones of the same view, which take a tenth of that.
+
+    A frame's time is nearly a constant plus a part that grows with its pixels.
+
+    Args:
+        make: Makes a frame of a view's size and throws it away.
+        view: The frame.
+        clock: Seconds.
+    """
+    pixels, seconds = [], []
+    for share in SHARES:
+        small = scaled(view, max(view.width // share, 1))
+        make(small)  # loads what the first frame alone waits for: kernels, recorded frames
+        began = clock()
+        make(small)
+        pixels.append(small.width * small.height)
+        seconds.append(clock() - began)
+    per_pixel = max(seconds[1] - seconds[0], 0.0) / max(pixels[1] - pixels[0], 1)
+    return seconds[1] + per_pixel * max(view.width * view.height - pixels[1], 0)
+
+
+def scaled(view: View, width: int) -> View:
+    """Return a view at another width, its height in proportion."""
+    return replace(view, width=width, height=max(round(view.height * width / view.width), 1))
+
+
+class Announced:
+    """Measures every size once and logs what it costs."""
+
+    def __init__(self, may_shrink: bool) -> None:
+        self._said: set[bytes] = set()
+        self._may_shrink = may_shrink
+
+    def before(self, view: View, make: Callable[[View], object]) -> None:
+        """Measure and log a view's size, unless that was done."""
+        if view.lens in self._said:
+            return
+        self._said.add(view.lens)
+        expected = cost_s(make, view)
+        text = f"camera {view.camera!r} at {view.width} x {view.height}: about {expected:.2g} s a frame on this machine"
+        half = scaled(view, view.width // 2)
+        if expected > SLOW_S and self._may_shrink:
+            text += (
+                f"; --render-width {half.width} makes frames of {half.width} x {half.height} and enlarges them, in about a quarter of that"
+            )
+        log.log(logging.WARNING if expected > SLOW_S else logging.INFO, text)
