@@ -45,7 +45,7 @@ def test_a_view_of_one_pixel_has_a_cost() -> None:
 
 def test_a_slow_size_is_a_warning_with_the_way_out_and_said_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     caplog.set_level(logging.INFO, "simrun.serve")
-    monkeypatch.setattr("alpasim_plugin.alpasim.server.costs.cost_s", lambda make, view: view.width / 1000)
+    monkeypatch.setattr("alpasim_plugin.alpasim.server.frames.cost_s", lambda make, view: view.width / 1000)
     said = Announced(may_shrink=True)
     for view in (VIEW, VIEW, replace(VIEW, lens=b"another", width=320, height=180)):
         said.before(view, lambda view: None)
