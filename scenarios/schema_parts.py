@@ -173,9 +173,7 @@ class _Actor(Part):
 
 
 class _InLane(_Actor):
-    lane: int | str = Field(
-        default=0, description="Forward lane (0: at the centre line), oncoming lane (-1: beside it), or a lane id."
-    )
+    lane: int | str = Field(default=0, description="Forward lane (0: at the centre line), oncoming lane (-1: beside it), or a lane id.")
     s_m: float = within(b.STATION_M, "Centre, along the road from the ego's start (lane id: that lane's beginning).")
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
