@@ -173,11 +173,9 @@ class _Actor(Part):
 
 
 class _InLane(_Actor):
-    lane: int | str = Field(
-        default=0, description="Forward lane (0 is next to the centre line), oncoming lane (-1 is next to it), or a lane id."
-    )
-    s_m: float = within(b.STATION_M, "Centre, metres along the road from the ego's start (lane id: from that lane's beginning).")
-    offset_m: float = within(b.OFFSET_M, "Metres left of the lane's middle, in its driving direction.", 0.0)
+    lane: int | str = Field(default=0, description="Forward lane (0: at the centre line), oncoming lane (-1: beside it), or a lane id.")
+    s_m: float = within(b.STATION_M, "Centre, along the road from the ego's start (lane id: that lane's beginning).")
+    offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
 
 class ParkedActor(_Actor):
@@ -247,7 +245,7 @@ class OncomingActor(_Actor):
     lane: int = within(b.LANE_INDEX, "Oncoming lane; 0 is next to the centre line.", 0)
     s_m: float = within(b.STATION_M, "Centre at the start, metres along the ego's path from the ego's start.")
     speed_mps: float = within(b.SPEED_MPS, "Speed.")
-    offset_m: float = within(b.OFFSET_M, "Metres left of the lane's middle, in its driving direction.", 0.0)
+    offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
 
 class HardBrakeActor(_InLane):
