@@ -29,7 +29,7 @@ def shifted(shot: Shot, left_m: float) -> Shot:
     """Return a shot from this far to the left, with nothing that was photographed there."""
     T = shot.photograph.T_world_camera.copy()
     T[:3, 3] -= left_m * T[:3, 0]  # OpenCV axes: x points right
-    return replace(shot, photograph=replace(shot.photograph, T_world_camera=T), rgb=np.full_like(shot.rgb, 235))
+    return replace(shot, photograph=replace(shot.photograph, T_world_camera=T), rgb=np.full_like(shot.rgb, 90))
 
 
 def fitted_to(rgb: U8) -> U8:
