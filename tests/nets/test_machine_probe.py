@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -30,15 +30,20 @@ def test_the_faster_precision_is_taken_and_its_error_recorded(monkeypatch, bf16_
 
 
 def test_the_precision_does_not_depend_on_what_else_the_machine_does(monkeypatch):
-    convolve = machine_probe._convolve
+    """Convolutions take 3 and 1 ms of the processor; in wall time, the second kind is interrupted for a second each time."""
+    convolve, clocks = machine_probe._convolve, {"processor": 0.0, "wall": 0.0}
 
     def interrupted(image, kernel):
-        if image.dtype == torch.bfloat16:
-            time.sleep(0.05)
+        quick = image.dtype == torch.bfloat16
+        clocks["processor"] += 0.001 if quick else 0.003
+        clocks["wall"] += 1.0 if quick else 0.003
         return convolve(image, kernel)
 
     monkeypatch.setattr(machine_probe, "_convolve", interrupted)
-    assert machine_probe._time_precisions().bf16_ms < 50
+    both = SimpleNamespace(process_time=lambda: clocks["processor"], perf_counter=lambda: clocks["wall"])
+    monkeypatch.setattr(machine_probe, "time", both)
+    probe = machine_probe._time_precisions()
+    assert (probe.fp32_ms, probe.bf16_ms) == pytest.approx((3.0, 1.0))
 
 
 @pytest.mark.parametrize(("slowdown", "number"), [({1: 4.0, 2: 2.5}, 2), ({1: 4.0, 2: 3.8}, 1), ({1: 4.0, 2: 300.0}, 1)])

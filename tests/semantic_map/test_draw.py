@@ -7,43 +7,24 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import Actor, Box, CameraSpec, FTheta, LaneMap, Trajectory
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.semantic_map import draw as conditioning
-from alpasim_plugin.semantic_map.draw import FThetaCamera, draw_map
-from alpasim_plugin.semantic_map.prepare import ActorBox, Area, LaneLine, MapExtras, TrafficLight, actor_boxes, prepare_map
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.prepare import ActorBox, Area, LaneLine, MapExtras, TrafficLight, prepare_map
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL
 from tests.examples import examples, first_of
 from tests.semantic_map.draw_reference import draw_map_reference, draw_reference
+from tests.semantic_map.views import CAR, EMPTY, FISH, PIN, at, fixed_lines, line
 
-# Camera axes in a rig that looks along x.
-AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-PIN = CameraSpec("pin", 256, 144, np.array([[128.0, 0, 128], [0, 128, 72], [0, 0, 1]]), AHEAD)
-FISH = FThetaCamera("fish", 256, 144, 128.0, 72.0, FTheta((0.0, 1 / 122), (0.0, 122.0, 0.0, -4.0), 1.2))
 CAMERAS = [PIN, FISH]
 SMALL = [replace(PIN, width=128, height=72, K=np.diag([0.5, 0.5, 1]) @ PIN.K), FISH.resized(128, 72)]
 COARSE_RAD = 0.12  # bends by a tenth of a pixel at these sizes
 PLAIN = replace(OPENGL, samples=1, ndc_widths=False)
-EMPTY = LaneMap({})
-CAR = Box(4.5, 1.9, 1.6)
-
-
-def at(x=0.0, y=0.0, z=1.5, yaw=0.0):
-    """Pose of a camera that stands at x, y, z in the world and looks along the yaw."""
-    return se2(x, y, yaw, z) @ AHEAD
-
-
-def line(*points):
-    return np.array(points, dtype=float)
 
 
 def lit(image, colour, slack=40):
     return (np.abs(image.astype(int) - colour).max(axis=2) <= slack) & (image.max(axis=2) > 0)
-
-
-def fixed_lines(*lines):
-    return MapExtras(lane_lines=tuple(lines))
 
 
 # --- what is drawn ----------------------------------------------------------------------------------------------------
@@ -268,53 +249,6 @@ def test_many_lines_do_not_overflow_the_buffers():
     image = draw_map(prepare_map(replace(EMPTY, road_edges=lines), style=PLAIN), PIN, at())
     assert len(conditioning._buffers.strokes) > 9000
     assert image[100, 128].any()
-
-
-# --- bad input --------------------------------------------------------------------------------------------------------
-
-
-def refused(call, *parts):
-    with pytest.raises(InputError) as caught:
-        call()
-    for part in parts:
-        assert part in str(caught.value)
-
-
-def test_nan_in_the_map_names_the_layer_and_the_point():
-    bad = line((0, 0, 0), (1, np.nan, 0))
-    refused(lambda: prepare_map(replace(EMPTY, road_edges=(bad,))), "preparing the semantic map", "road_boundary", "point 1", "nan")
-    refused(lambda: prepare_map(replace(EMPTY, crosswalks=(bad,))), "crosswalk", "point 1")
-    refused(lambda: prepare_map(EMPTY, fixed_lines(LaneLine(bad))), "lane line", "point 1")
-    refused(lambda: prepare_map(replace(EMPTY, poles=(np.zeros((2, 2)),))), "pole", "shape (2, 2)")
-
-
-def test_poses_that_are_none():
-    pose = at()
-    pose[0, 3] = np.nan
-    scene = prepare_map(EMPTY)
-    refused(lambda: draw_map(scene, PIN, pose), "drawing the semantic map, camera pose", "not finite")
-    refused(lambda: draw_map(scene, PIN, np.eye(3)), "shape (3, 3)")
-    refused(lambda: draw_map(scene, PIN, at(), (ActorBox(np.eye(4) * 2, CAR, "car"),)), "actor box (car)", "no rotation")
-    refused(lambda: draw_map(scene, PIN, at(), (ActorBox(np.eye(4), Box(1, -1, 1), "car"),)), "actor box (car)", "finite sizes")
-    refused(lambda: prepare_map(replace(EMPTY, signs=((pose, CAR),))), "sign", "not finite")
-
-
-def test_areas_and_cameras_that_are_none():
-    refused(lambda: prepare_map(replace(EMPTY, crosswalks=(line((0, 0, 0), (1, 0, 0)),))), "crosswalk", "an outline of 2 points")
-    scene = prepare_map(EMPTY)
-    refused(lambda: draw_map(scene, replace(PIN, K=np.diag([-1.0, 1, 1])), at()), "camera pin", "positive focal lengths")
-    refused(lambda: draw_map(scene, replace(PIN, width=0), at()), "camera pin", "0 x 144 pixels")
-    refused(lambda: draw_map(scene, replace(FISH, lens=FTheta((0.0,), (0.0, 1.0), 0.0)), at()), "camera fish", "largest angle")
-    folding = FTheta((0.0, 0.01), (0.0, 100.0, -80.0), 1.2)
-    refused(lambda: draw_map(scene, replace(FISH, lens=folding), at()), "camera fish", "does not grow")
-
-
-def test_actor_boxes_join_poses_with_sizes():
-    track = Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
-    known = (Actor("a", "car", CAR, track), Actor("b", "bus", CAR, track))
-    (one,) = actor_boxes({"b": np.eye(4)}, known)
-    assert (one.label, one.box) == ("bus", CAR)
-    refused(lambda: actor_boxes({"x": np.eye(4)}, known), "actor x", "a pose without a box")
 
 
 # --- the twin ---------------------------------------------------------------------------------------------------------
