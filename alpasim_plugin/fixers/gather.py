@@ -1,6 +1,8 @@
-"""What a generator in pixels reads and writes, for processors: one pass over the images instead of one for each operation.
+"""What a generator in pixels reads and writes, and how it compares references with a picture, for processors: one pass over the images
+instead of one for each operation.
 
-`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `gather_beside_cpu` and `mix_cpu` are those of `nets.reference_blend`.
+`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `gather_beside_cpu`, `likeness_cpu`, `offsets_cpu` and `mix_cpu` are those of
+`nets.reference_blend`.
 """
 
 # Numba's decorators are untyped.
@@ -14,7 +16,7 @@ from numba import njit
 from torch import Tensor
 
 from alpasim_plugin.nets.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
-from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, NOWHERE, BesideCells, BlendHeads
+from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, MATCH_CELLS, NOWHERE, OFFSET_PX, BesideCells, BlendHeads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 
@@ -89,80 +91,211 @@ def gather_beside_cpu(references: Tensor, render: Tensor) -> BesideCells:
 def _gather_beside(references, render, mean4, mean2, each4, each2):
     batch, count, height, width, _ = references.shape
     share = np.float32(1.0) / np.float32(count)
+    run4, run2 = CELL * CHANNELS, DETAIL * CHANNELS  # values of a cell's row
+    row, mean = np.empty(CHANNELS * width, np.float32), np.empty(CHANNELS * width, np.float32)
     for b in range(batch):
         for y in range(height):
-            i4, i2, r4, r2 = y // CELL, y // DETAIL, (y % CELL) * CELL, (y % DETAIL) * DETAIL
-            for x in range(width):
-                j4, j2 = x // CELL, x // DETAIL
-                at4, at2 = CHANNELS * (r4 + x % CELL), CHANNELS * (r2 + x % DETAIL)
-                for c in range(CHANNELS):
-                    total = np.float32(0.0)
-                    for k in range(count):
-                        value = references[b, k, y, x, 3]
-                        if c < 3:
-                            value *= references[b, k, y, x, c] - render[b, y, x, c]
-                        each4[b * count + k, i4, j4, at4 + c] = value
-                        each2[b * count + k, i2, j2, at2 + c] = value
-                        total += value
-                    mean4[b, i4, j4, at4 + c] = total * share
-                    mean2[b, i2, j2, at2 + c] = total * share
+            i4, i2, at4, at2 = y // CELL, y // DETAIL, (y % CELL) * run4, (y % DETAIL) * run2
+            mean[:] = np.float32(0.0)
+            for k in range(count):
+                picture, own = references[b, k, y], render[b, y]
+                for x in range(width):
+                    holds = picture[x, 3]
+                    for c in range(3):
+                        row[CHANNELS * x + c] = (picture[x, c] - own[x, c]) * holds
+                    row[CHANNELS * x + 3] = holds
+                for i in range(len(row)):
+                    mean[i] += row[i] * share
+                _put_runs(row, each4[b * count + k, i4], at4, run4)
+                _put_runs(row, each2[b * count + k, i2], at2, run2)
+            _put_runs(mean, mean4[b, i4], at4, run4)
+            _put_runs(mean, mean2[b, i2], at2, run2)
+
+
+@njit(cache=True, nogil=True)
+def _put_runs(row, cells, at, run):
+    """Write a row of pixels into the row of cells that it crosses, ``run`` values into each, from ``at`` on."""
+    for j in range(cells.shape[0]):
+        cell = cells[j]
+        for i in range(run):
+            cell[at + i] = row[run * j + i]
+
+
+@torch.library.custom_op("simrun::likeness", mutates_args=(), device_types="cpu")
+def likeness_cpu(sought: Tensor, shown: Tensor) -> Tensor:
+    """Return the same as `nets.reference_blend.likeness`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
+    reach = 2 * MATCH_CELLS + 1
+    out = torch.empty(*shown.shape[:3], reach * reach)
+    _likeness(*(np.ascontiguousarray(x.float().numpy()) for x in (sought, shown)), out.numpy())
+    return out.to(sought.dtype)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _likeness(sought, shown, out):
+    """Multiply and add with a row's cells as the lanes of vectors: channels are few, cells are many."""
+    images, height, width, channels = shown.shape
+    reach, border = 2 * MATCH_CELLS + 1, MATCH_CELLS
+    count = images // sought.shape[0]
+    around = np.zeros((height + 2 * border, channels, width + 2 * border), np.float32)
+    own = np.empty((channels, width), np.float32)
+    alike = np.empty((reach * reach, width), np.float32)
+    share = np.float32(1.0) / np.float32(channels)
+    for n in range(images):
+        for i in range(height):
+            for j in range(width):
+                for c in range(channels):
+                    around[i + border, c, j + border] = shown[n, i, j, c]
+        for i in range(height):
+            for j in range(width):
+                for c in range(channels):
+                    own[c, j] = sought[n // count, i, j, c] * share
+            alike[:] = np.float32(0.0)
+            for di in range(reach):
+                for c in range(channels):
+                    line, mine = around[i + di, c], own[c]
+                    for dj in range(reach):
+                        sums = alike[reach * di + dj]
+                        for j in range(width):
+                            sums[j] += mine[j] * line[j + dj]
+            for j in range(width):
+                for place in range(reach * reach):
+                    out[n, i, j, place] = alike[place, j]
+
+
+@torch.library.custom_op("simrun::offsets", mutates_args=(), device_types="cpu")
+def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
+    """Return the same as `nets.reference_blend.offsets`, of float32 tensors on the CPU, to rounding; it has no gradient."""
+    out = torch.empty(at2.shape)
+    _offsets(*(np.ascontiguousarray(x.numpy()) for x in (at2, at4)), out.numpy())
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _offsets(at2, at4, out):
+    images, height, width, axes = at2.shape
+    own, next_to, one, two, most = np.float32(0.75), np.float32(0.25), np.float32(1.0), np.float32(2.0), np.float32(OFFSET_PX)
+    columns = at4.shape[2]
+    rows, row, fallen = np.empty((columns, axes), np.float32), np.empty(width * axes, np.float32), np.empty(width * axes, np.float32)
+    for n in range(images):
+        for y in range(height):
+            i = y // 2
+            other = max(i - 1, 0) if y % 2 == 0 else min(i + 1, at4.shape[1] - 1)
+            for j in range(columns):
+                for c in range(axes):
+                    rows[j, c] = own * at4[n, i, j, c] + next_to * at4[n, other, j, c]
+            for j in range(columns):
+                before, after = max(j - 1, 0), min(j + 1, columns - 1)
+                for c in range(axes):
+                    half = own * rows[j, c]
+                    row[2 * axes * j + c] = half + next_to * rows[before, c] + at2[n, y, 2 * j, c]
+                    row[2 * axes * j + axes + c] = half + next_to * rows[after, c] + at2[n, y, 2 * j + 1, c]
+            for x in range(len(row)):
+                fallen[x] = -two * abs(row[x])
+            _exponentials(fallen)
+            for x in range(len(row)):  # tanh |x| = (1 - exp(-2 |x|)) / (1 + exp(-2 |x|))
+                row[x] = np.copysign(most * (one - fallen[x]) / (one + fallen[x]), row[x])
+            out[n, y] = row.reshape(width, axes)
 
 
 def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
     """Return the same as `nets.reference_blend.mix`, of float32 tensors on the CPU, to rounding."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
     images = (np.ascontiguousarray(x.numpy()) for x in (repaired, references, *heads))
-    _mix(*images, np.float32(NOWHERE), out.numpy(), recorded.numpy())
+    _mix(*images, out.numpy(), recorded.numpy())
     return out, recorded
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _mix(repaired, references, weight, offset_px, correction, nowhere, out, recorded):
+def _mix(repaired, references, weight, offset_px, correction, out, recorded):
+    """Blend a row at a time: where each pixel is looked up, what is found there, its share; all in float32, so that rows are vectors."""
     batch, count, height, width, _ = references.shape
-    side, half = DETAIL, np.float32(0.5)
-    cell_rows, cell_columns = height // side, width // side
+    one, zero, largest, nowhere = np.float32(1.0), np.float32(0.0), np.float32(LARGEST), np.float32(NOWHERE)
+    right, below = np.float32(width - 1), np.float32(height - 1)
+    x0, y0 = np.empty(width, np.int32), np.empty(width, np.int32)
+    fx, fy = np.empty(width, np.float32), np.empty(width, np.float32)
+    total, share = np.empty(width, np.float32), np.empty(width, np.float32)
+    found, blended = np.empty((width, CHANNELS), np.float32), np.empty((width, 3), np.float32)
     for b in range(batch):
         for y in range(height):
-            # Offsets are interpolated between the middles of cells.
-            v = min(max((y + half) / side - half, np.float32(0.0)), np.float32(cell_rows - 1))
-            v0 = int(v)
-            v1, fv = min(v0 + 1, cell_rows - 1), np.float32(v - v0)
+            i, into_row = y // DETAIL, y % DETAIL * DETAIL
+            other = max(i - 1, 0) if y % DETAIL == 0 else min(i + 1, height // DETAIL - 1)
+            total[:] = one
+            blended[:] = repaired[b, y]
+            for k in range(count):
+                _lookups(offset_px[b, k, i], offset_px[b, k, other], np.float32(y), right, below, x0, y0, fx, fy)
+                image = references[b, k]
+                for x in range(width):
+                    left, top = x0[x], y0[x]
+                    upper, lower = image[top], image[min(top + 1, height - 1)]
+                    beside = min(left + 1, width - 1)
+                    a11 = fy[x] * fx[x]
+                    a01, a10 = fx[x] - a11, fy[x] - a11
+                    a00 = one - fx[x] - a10
+                    for c in range(CHANNELS):
+                        found[x, c] = a00 * upper[left, c] + a01 * upper[beside, c] + a10 * lower[left, c] + a11 * lower[beside, c]
+                said = weight[b, k, i]
+                for x in range(width):
+                    share[x] = min(said[x // DETAIL, into_row + x % DETAIL], largest)
+                _exponentials(share)
+                extra = correction[b, k, i]
+                for x in range(width):
+                    part = share[x] * min(max(found[x, 3], nowhere), one)
+                    total[x] += part
+                    at = 3 * (into_row + x % DETAIL)
+                    for c in range(3):
+                        blended[x, c] += part * (found[x, c] + extra[x // DETAIL, at + c])
             for x in range(width):
-                u = min(max((x + half) / side - half, np.float32(0.0)), np.float32(cell_columns - 1))
-                u0 = int(u)
-                u1, fu = min(u0 + 1, cell_columns - 1), np.float32(u - u0)
-                i, j = y // side, x // side
-                inside = (y % side) * side + x % side
-                total = np.float32(1.0)
-                r, g, blue = repaired[b, y, x, 0], repaired[b, y, x, 1], repaired[b, y, x, 2]
-                for k in range(count):
-                    field = offset_px[b, k]
-                    w00, w01, w10, w11 = (1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu
-                    dx = w00 * field[v0, u0, 0] + w01 * field[v0, u1, 0] + w10 * field[v1, u0, 0] + w11 * field[v1, u1, 0]
-                    dy = w00 * field[v0, u0, 1] + w01 * field[v0, u1, 1] + w10 * field[v1, u0, 1] + w11 * field[v1, u1, 1]
-                    px = min(max(x + dx, np.float32(0.0)), np.float32(width - 1))
-                    py = min(max(y + dy, np.float32(0.0)), np.float32(height - 1))
-                    x0, y0 = int(px), int(py)
-                    x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
-                    fx, fy = np.float32(px - x0), np.float32(py - y0)
-                    a00, a01, a10, a11 = (1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx
-                    image = references[b, k]
-                    holds = a00 * image[y0, x0, 3] + a01 * image[y0, x1, 3] + a10 * image[y1, x0, 3] + a11 * image[y1, x1, 3]
-                    share = np.exp(min(weight[b, k, i, j, inside], LARGEST)) * min(max(holds, nowhere), np.float32(1.0))
-                    total += share
-                    extra = correction[b, k, i, j]
-                    at = 3 * inside
-                    r += share * (
-                        a00 * image[y0, x0, 0] + a01 * image[y0, x1, 0] + a10 * image[y1, x0, 0] + a11 * image[y1, x1, 0] + extra[at]
-                    )
-                    g += share * (
-                        a00 * image[y0, x0, 1] + a01 * image[y0, x1, 1] + a10 * image[y1, x0, 1] + a11 * image[y1, x1, 1] + extra[at + 1]
-                    )
-                    blue += share * (
-                        a00 * image[y0, x0, 2] + a01 * image[y0, x1, 2] + a10 * image[y1, x0, 2] + a11 * image[y1, x1, 2] + extra[at + 2]
-                    )
-                out[b, y, x, 0], out[b, y, x, 1], out[b, y, x, 2] = r / total, g / total, blue / total
-                recorded[b, y, x, 0] = 1 - 1 / total
+                over = one / total[x]
+                for c in range(3):
+                    out[b, y, x, c] = blended[x, c] * over
+                recorded[b, y, x, 0] = max(one - over, zero)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _lookups(near, far, y, right, below, x0, y0, fx, fy):
+    """Write where the pixels of a row look a reference up: whole columns and rows, and what is beyond them.
+
+    Offsets ``(W / 2, 2)`` are interpolated between the middles of cells, which are two pixels wide: a quarter of the neighbour's on the
+    pixel's side and three quarters of the cell's own; ``near`` is the cell row of the pixels, ``far`` its neighbour.
+    """
+    own, next_to, zero = np.float32(0.75), np.float32(0.25), np.float32(0.0)
+    columns = near.shape[0]
+    for j in range(columns):
+        before, after = max(j - 1, 0), min(j + 1, columns - 1)
+        dx, dy = own * near[j, 0] + next_to * far[j, 0], own * near[j, 1] + next_to * far[j, 1]
+        for half in range(DETAIL):
+            n = before if half == 0 else after
+            px = np.float32(DETAIL * j + half) + (own * dx + next_to * (own * near[n, 0] + next_to * far[n, 0]))
+            py = y + (own * dy + next_to * (own * near[n, 1] + next_to * far[n, 1]))
+            px, py = min(max(px, zero), right), min(max(py, zero), below)
+            x, whole_x, whole_y = DETAIL * j + half, np.int32(px), np.int32(py)
+            x0[x], y0[x] = whole_x, whole_y
+            fx[x], fy[x] = px - np.float32(whole_x), py - np.float32(whole_y)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _exponentials(values):
+    """Replace float32 values by their exponentials, within 3e-7 of them; those below -87 by that of -87.
+
+    A whole power of two, written as the exponent of a float, times a polynomial on [-1/2, 1/2] (Taylor, degree 6, in the natural logarithm
+    of two).
+    """
+    power = np.empty(len(values), np.int32)
+    scale = power.view(np.float32)
+    for i in range(len(values)):
+        t = max(values[i], np.float32(-87.0)) * np.float32(1.4426950408889634)
+        whole = np.int32(np.floor(t + np.float32(0.5)))
+        f = (t - np.float32(whole)) * np.float32(0.6931471805599453)
+        power[i] = (whole + np.int32(127)) << np.int32(23)
+        p = np.float32(1 / 720)
+        p = p * f + np.float32(1 / 120)
+        p = p * f + np.float32(1 / 24)
+        p = p * f + np.float32(1 / 6)
+        p = p * f + np.float32(1 / 2)
+        p = p * f + np.float32(1.0)
+        values[i] = p * f + np.float32(1.0)
+    for i in range(len(values)):
+        values[i] *= scale[i]
 
 
 def draw_and_gather() -> None:
@@ -181,3 +314,9 @@ def draw_and_gather() -> None:
     image = torch.zeros(1, side_px, side_px, 3)
     state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image, image[..., :1])
     gather_cells_cpu(image, image[..., :1], image, state, image + 1)
+    references, at2, at4 = torch.zeros(1, 1, side_px, side_px, 4), image[:, ::DETAIL, ::DETAIL, :2], image[:, ::CELL, ::CELL]
+    gather_beside_cpu(references, image)
+    offset_px = offsets_cpu(at2, at4[..., :2])[:, None]
+    heads = BlendHeads(offset_px.repeat(1, 1, 1, 1, 2), offset_px, offset_px.repeat(1, 1, 1, 1, 6))
+    likeness_cpu(at4, at4)
+    mix_cpu(image, references, heads)

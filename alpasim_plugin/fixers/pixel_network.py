@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
-from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, mix_cpu
+from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
 from alpasim_plugin.nets.pixel_generator import GatheredCells, PixelGenerator, PixelSizes, PixelState
@@ -62,6 +62,8 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     else:
         net, trained, note = _untrained(settings), False, f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
+    if device == "cpu" and net.blend is not None:
+        net.blend.likeness, net.blend.offsets = likeness_cpu, offsets_cpu
     step = RecordedStep(net) if device == "cpu" else partial(_step_on, net)
     return LoadedGenerator(net, step, trained, note, precision, torch.device(device))
 

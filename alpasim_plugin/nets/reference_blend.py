@@ -17,6 +17,7 @@ references. A warp that is wrong costs nothing where the network gives it no wei
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -73,6 +74,9 @@ class ReferenceBlend(nn.Module):
         self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
         self.write = nn.Linear(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        # Where no gradient is asked for, faster ones may stand here.
+        self.likeness: Callable[[Tensor, Tensor], Tensor] = likeness
+        self.offsets: Callable[[Tensor, Tensor], Tensor] = offsets
         for layer in (self.stem, self.read, self.match, self.shift, self.up, self.write):
             nn.init.zeros_(layer.weight)
             if layer.bias is not None:
@@ -96,33 +100,38 @@ class ReferenceBlend(nn.Module):
         """
         b = y.shape[0]
         k = beside.each4.shape[0] // b
-        side = activation(_repeated(y, k) + self.coarse(beside.each4.to(y.dtype)), inplace=True)
-        alike = likeness(_repeated(self.sought(y), k), self.shown(side))
+        side = activation(_added(self.coarse(beside.each4.to(y.dtype)), y), inplace=True)
+        alike = self.likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
         at4 = activation(self.align[1](at4), inplace=True)
-        joined = _repeated(fine, k) + self.own(beside.each2.to(fine.dtype)) + self.up(at4)
+        joined = _added(self.own(beside.each2.to(fine.dtype)).add_(self.up(at4)), fine)
         said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
         weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-        seen_at4 = F.interpolate(self.shift(at4).float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
-        offset_px = torch.tanh(offset + seen_at4.permute(0, 2, 3, 1).view(offset.shape)) * OFFSET_PX
-        return BlendHeads(weight, offset_px, correction)
+        return BlendHeads(weight, self.offsets(offset.flatten(0, 1), self.shift(at4).float()).view(offset.shape), correction)
 
 
 def likeness(sought: Tensor, shown: Tensor) -> Tensor:
     """Compare features with those of the cells around, the mean of products over channels.
 
     Args:
-        sought: ``(N, h, w, C)``.
-        shown: The same; beyond the border nothing is alike.
+        sought: ``(B, h, w, C)``.
+        shown: ``(B K, h, w, C)`` K references of each; beyond the border nothing is alike.
 
     Returns:
-        ``(N, h, w, (2 MATCH_CELLS + 1)^2)`` by row and column of the other cell.
+        ``(B K, h, w, (2 MATCH_CELLS + 1)^2)`` by row and column of the other cell.
     """
     h, w = sought.shape[1:3]
     reach = 2 * MATCH_CELLS + 1
     around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
+    each = sought[:, None].expand(-1, len(shown) // len(sought), -1, -1, -1).flatten(0, 1)
     mean = sought.new_full((sought.shape[-1], 1), 1 / sought.shape[-1])  # as a product: a sum over few channels is slow on a CPU
-    return torch.cat([(sought * around[:, i : i + h, j : j + w]) @ mean for i in range(reach) for j in range(reach)], dim=-1)
+    return torch.cat([(each * around[:, i : i + h, j : j + w]) @ mean for i in range(reach) for j in range(reach)], dim=-1)
+
+
+def offsets(at2: Tensor, at4: Tensor) -> Tensor:
+    """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are said at half the resolution and, coarser, at a quarter of it."""
+    finer = F.interpolate(at4.permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+    return torch.tanh(at2 + finer.permute(0, 2, 3, 1)) * OFFSET_PX
 
 
 class Sources(NamedTuple):
@@ -178,9 +187,10 @@ def gather_beside(references: Tensor, render: Tensor) -> BesideCells:
     return BesideCells(cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL))
 
 
-def _repeated(x: Tensor, times: int) -> Tensor:
-    """Repeat every image of a batch: ``(B, ...)`` to ``(B times, ...)``."""
-    return x[:, None].expand(x.shape[0], times, *x.shape[1:]).flatten(0, 1)
+def _added(each: Tensor, one: Tensor) -> Tensor:
+    """Add an image ``(B, ...)`` to each of K: ``(B K, ...)``, in place."""
+    parts = each.view(one.shape[0], -1, *one.shape[1:])
+    return parts.add_(one[:, None]).flatten(0, 1)
 
 
 def _sampled(images: Tensor, offset: Tensor) -> Tensor:

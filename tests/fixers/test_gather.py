@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, mix_cpu
+from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
 from alpasim_plugin.nets.pixel_generator import PixelState, gather_cells
-from alpasim_plugin.nets.reference_blend import BlendHeads, gather_beside, mix, sources_of
+from alpasim_plugin.nets.reference_blend import BlendHeads, gather_beside, likeness, mix, offsets, sources_of
 
 
 def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Tensor, Tensor, PixelState]:
@@ -72,3 +72,35 @@ def test_a_reference_with_an_enormous_weight_is_the_picture_and_nothing_overflow
     out, recorded = mix_cpu(repaired, images, heads)
     assert torch.allclose(out, torch.ones_like(out), atol=1e-5)
     assert torch.equal(recorded, torch.ones_like(recorded))
+
+
+@pytest.mark.parametrize(("batch", "references", "height", "width", "channels"), [(1, 1, 1, 1, 16), (2, 3, 9, 16, 16), (1, 2, 4, 20, 5)])
+def test_features_are_compared_as_the_operations_one_by_one_do(batch: int, references: int, height: int, width: int, channels: int) -> None:
+    draw = torch.Generator().manual_seed(width)
+    sought = torch.randn(batch, height, width, channels, generator=draw)
+    shown = torch.randn(batch * references, height, width, channels, generator=draw)
+    assert torch.allclose(likeness_cpu(sought, shown), likeness(sought, shown), atol=1e-6)
+    coarse = sought.bfloat16(), shown.bfloat16()
+    exact = likeness(*(x.double() for x in coarse))
+    assert likeness_cpu(*coarse).dtype == torch.bfloat16
+    assert torch.allclose(likeness_cpu(*coarse).double(), exact, rtol=2**-8, atol=1e-6)  # rounded once, where operations round each product
+
+
+@pytest.mark.parametrize(("images", "height", "width"), [(1, 2, 2), (3, 8, 16), (2, 6, 22)])
+def test_offsets_are_joined_as_the_operations_one_by_one_do(images: int, height: int, width: int) -> None:
+    draw = torch.Generator().manual_seed(width)
+    at2 = torch.randn(images, height, width, 2, generator=draw) * 3
+    at4 = torch.randn(images, height // 2, width // 2, 2, generator=draw)
+    at2[0, 0, 0], at2[0, 1, 1] = torch.tensor([300.0, -300.0]), torch.tensor([1e-4, -0.0])
+    assert torch.allclose(offsets_cpu(at2, at4), offsets(at2, at4), atol=2e-5)
+
+
+def test_weights_over_all_magnitudes_blend_as_in_float64() -> None:
+    weight = torch.linspace(-100, 59, 8 * 8 * 4).view(1, 1, 8, 8, 4)
+    draw = torch.Generator().manual_seed(5)
+    repaired, images = torch.rand(1, 16, 16, 3, generator=draw), torch.rand(1, 1, 16, 16, 4, generator=draw)
+    heads = BlendHeads(weight, torch.zeros(1, 1, 8, 8, 2), torch.zeros(1, 1, 8, 8, 12))
+    out, recorded = mix_cpu(repaired, images, heads)
+    exact = mix(sources_of(repaired.double(), images.double(), BlendHeads(*(part.double() for part in heads))))
+    assert torch.allclose(out.double(), exact[0], atol=1e-6)
+    assert torch.allclose(recorded.double(), exact[1], atol=1e-6)
