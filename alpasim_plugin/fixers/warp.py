@@ -14,12 +14,13 @@ import numpy as np
 from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
 SLACK, SLACK_M = 0.12, 0.4  # two depths agree within this share and this length: reconstructions are no better
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
+PARALLEL = 1e-300  # stands for the slope of a ray along a wall, so that it meets that wall's plane nowhere near
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
 VALID, INCONSISTENT = 255, 128  # last channel of a reference: validity: the depths agree; they do not
 
@@ -106,8 +107,8 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
     )
     x, y, held = warp_coordinates(lookup)
     out = np.empty((*held.shape, 4), np.uint8)
-    out[..., :3] = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    out[..., 3] = held
+    colour = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    cv2.mixChannels([colour, held], [out], [0, 0, 1, 1, 2, 2, 3, 3])  # in place
     return out
 
 
@@ -131,71 +132,79 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     ray = T_world_camera[:3, :3] @ np.linalg.inv(K)
     project = K_then @ T_then_world[:3]
     A, b = project[:, :3] @ ray, project[:, :3] @ T_world_camera[:3, 3] + project[:, 3]
-    arrays = (
-        np.ascontiguousarray(part, dtype=np.float64) for part in (A, b, ray, T_world_camera[:3, 3], project, T_box_world, T_then_box, sizes)
-    )
-    _coordinates(np.ascontiguousarray(depth), np.ascontiguousarray(depth_then), *arrays, free_share, x, y, held)
+    lines, then = np.ascontiguousarray(depth), np.ascontiguousarray(depth_then)
+    _coordinates(lines, then, A, b, free_share, x, y, held)
+    seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, depth.shape)
+    to_then: F64 = project @ T_then_box
+    for i in reversed(range(len(sizes))):  # of two boxes the first counts
+        part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
+        images = x[part], y[part], held[part]
+        _coordinates_on_box(lines[part], then, seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i], free_share, *images)
     return x, y, held
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _coordinates(depth, depth_then, A, b, ray, eye, project, T_box, T_then_box, sizes, free_share, x, y, held):
-    """Fill ``x``, ``y`` and ``held``; the loop of `plain_coordinates`."""
+def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
+    """Fill ``x``, ``y`` and ``held`` as if nothing moved; the loop of `plain_coordinates`, whose rows are vectors."""
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
-    actors = sizes.shape[0]
+    surfaces = depth_then.reshape(-1)
+    place, distance, seen = np.empty(width, np.uint32), np.empty(width, np.float64), np.empty(width, np.bool_)
     for row in range(height):
         v0 = row + 0.5
+        ax, ay, az = A[0, 1] * v0 + A[0, 2], A[1, 1] * v0 + A[1, 2], A[2, 1] * v0 + A[2, 2]
         for column in range(width):
             u0 = column + 0.5
-            z = np.float64(depth[row, column]) if depth[row, column] > 0 else np.float64(INFINITY_M)
-            qx = z * (A[0, 0] * u0 + A[0, 1] * v0 + A[0, 2]) + b[0]
-            qy = z * (A[1, 0] * u0 + A[1, 1] * v0 + A[1, 2]) + b[1]
-            rz = z * (A[2, 0] * u0 + A[2, 1] * v0 + A[2, 2]) + b[2]
-            if actors and z < INFINITY_M:
-                px = z * (ray[0, 0] * u0 + ray[0, 1] * v0 + ray[0, 2]) + eye[0]
-                py = z * (ray[1, 0] * u0 + ray[1, 1] * v0 + ray[1, 2]) + eye[1]
-                pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
-                a = _box_around(px, py, pz, T_box, sizes)
-                if a >= 0:
-                    W, B = T_then_box[a], T_box[a]
-                    if not np.isfinite(W[0, 0]):
-                        continue
-                    bx = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
-                    by = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
-                    bz = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
-                    px = W[0, 0] * bx + W[0, 1] * by + W[0, 2] * bz + W[0, 3]
-                    py = W[1, 0] * bx + W[1, 1] * by + W[1, 2] * bz + W[1, 3]
-                    pz = W[2, 0] * bx + W[2, 1] * by + W[2, 2] * bz + W[2, 3]
-                    qx = project[0, 0] * px + project[0, 1] * py + project[0, 2] * pz + project[0, 3]
-                    qy = project[1, 0] * px + project[1, 1] * py + project[1, 2] * pz + project[1, 3]
-                    rz = project[2, 0] * px + project[2, 1] * py + project[2, 2] * pz + project[2, 3]
-            if not rz > NEAREST_M:
-                continue
-            u, v = qx / rz, qy / rz
-            if not (0 <= u < columns_then and 0 <= v < rows_then):
-                continue
-            x[row, column], y[row, column] = u - 0.5, v - 0.5
-            there = np.float64(depth_then[int(v), int(u)])
-            there = there if there > 0 else np.float64(INFINITY_M)
-            far = there > INFINITY_M / 2 and rz > INFINITY_M / 2
-            agrees = far or there >= free_share * rz or abs(there - rz) < SLACK * rz + SLACK_M
-            held[row, column] = VALID if agrees else INCONSISTENT
+            z = np.float64(depth[row, column])
+            z = z if z > 0 else INFINITY_M
+            rz = z * (A[2, 0] * u0 + az) + b[2]
+            u = (z * (A[0, 0] * u0 + ax) + b[0]) / rz
+            v = (z * (A[1, 0] * u0 + ay) + b[1]) / rz
+            there = (rz > NEAREST_M) & (u >= 0) & (u < columns_then) & (v >= 0) & (v < rows_then)
+            u, v = u if there else 0.5, v if there else 0.5
+            x[row, column], y[row, column] = np.float32(u - 0.5), np.float32(v - 0.5)
+            place[column], distance[column], seen[column] = np.uint32(np.int32(v) * columns_then + np.int32(u)), rz, there
+        for column in range(width):
+            held[row, column] = _held(surfaces[place[column]], distance[column], free_share) if seen[column] else 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _held(surface, rz, free_share):
+    """Return how well it holds that a point at depth ``rz`` of the recorded camera is shown by its pixel of depth ``surface``."""
+    there = np.float64(surface) if surface > 0 else INFINITY_M
+    far = (there > INFINITY_M / 2) & (rz > INFINITY_M / 2)
+    agrees = far | (there >= free_share * rz) | (abs(there - rz) < SLACK * rz + SLACK_M)
+    return VALID if agrees else INCONSISTENT
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _box_around(px, py, pz, T_box, sizes):
-    """Return the first box that a point of the world lies in; -1: none."""
-    for a in range(sizes.shape[0]):
-        B = T_box[a]
-        qz = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
-        if not -sizes[a, 2] / 2 + SOLE_M <= qz < sizes[a, 2] / 2 + AROUND_M[2]:
-            continue
-        qx = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
-        qy = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
-        if abs(qx) < sizes[a, 0] / 2 + AROUND_M[0] and abs(qy) < sizes[a, 1] / 2 + AROUND_M[1]:
-            return a
-    return -1
+def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, free_share, x, y, held):
+    """Fill in what moves with one box in the part of the picture that it may be seen in; see `SeenBoxes`.
+
+    ``project`` maps the box's axes to the recorded frame's homogeneous pixels; it is not finite where the actor was absent.
+    """
+    rows_then, columns_then = depth_then.shape
+    low, high = walls
+    for row in range(depth.shape[0]):
+        v0 = pixels[0] + row + 0.5
+        for column in range(depth.shape[1]):
+            u0, z = pixels[2] + column + 0.5, np.float64(depth[row, column])
+            if not z > 0:
+                continue
+            px = z * (ray[0, 0] * u0 + ray[0, 1] * v0 + ray[0, 2]) + eye[0]
+            py = z * (ray[1, 0] * u0 + ray[1, 1] * v0 + ray[1, 2]) + eye[1]
+            pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
+            if not (low[0] < px < high[0] and low[1] < py < high[1] and low[2] <= pz < high[2]):
+                continue
+            x[row, column], y[row, column], held[row, column] = 0, 0, 0
+            rz = project[2, 0] * px + project[2, 1] * py + project[2, 2] * pz + project[2, 3]
+            if not rz > NEAREST_M:
+                continue
+            u = (project[0, 0] * px + project[0, 1] * py + project[0, 2] * pz + project[0, 3]) / rz
+            v = (project[1, 0] * px + project[1, 1] * py + project[1, 2] * pz + project[1, 3]) / rz
+            if 0 <= u < columns_then and 0 <= v < rows_then:
+                x[row, column], y[row, column] = u - 0.5, v - 0.5
+                held[row, column] = _held(depth_then[int(v), int(u)], rz, free_share)
 
 
 def on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
@@ -209,47 +218,58 @@ def on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mappin
     """
     _, T_box_world, sizes = placed_boxes(actors, boxes)
     out: Bool = np.zeros(shape, dtype=bool)
-    for T_box_camera, size in zip(T_box_world @ T_world_camera, sizes, strict=True):
-        low, high = _walls(size)
-        corners = _moved(K @ inverse(T_box_camera)[:3], np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3))
-        if (corners[:, 2] <= 0).all():
-            continue
-        first, last = np.zeros(2, dtype=np.int64), np.array(shape[::-1])
-        if (corners[:, 2] > NEAREST_M).all():  # else some corners lie behind the camera, and the box may reach anywhere
-            u_v = corners[:, :2] / corners[:, 2:]
-            first, last = (np.clip(edge, 0, last).astype(np.int64) for edge in (np.floor(u_v.min(axis=0)), np.ceil(u_v.max(axis=0))))
-        part = out[first[1] : last[1], first[0] : last[0]]
-        ray = np.ascontiguousarray(T_box_camera[:3, :3] @ np.linalg.inv(K))
-        _add_box(ray, T_box_camera[:3, 3].copy(), low, high, first[0], first[1], part)
+    for ray, eye, walls, pixels in zip(*_seen_boxes(K, T_world_camera, T_box_world, sizes, shape), strict=True):
+        _add_box(ray, eye, walls, pixels, out[slice(*pixels[:2]), slice(*pixels[2:])])
     return out
 
 
-def _walls(size: F64) -> tuple[F64, F64]:
-    """Return the least and the greatest coordinates of what moves with a box."""
-    around, up = size / 2 + np.array(AROUND_M), size[2] / 2
-    return np.array([-around[0], -around[1], SOLE_M - up]), around
+class SeenBoxes(NamedTuple):
+    """What moves with each of A boxes, and where a camera may see it."""
+
+    ray: F64  # (A, 3, 3) maps a pixel (u, v, 1) to its ray in the box's axes
+    eye: F64  # (A, 3) the camera in the box's axes
+    walls: F64  # (A, 2, 3) least and greatest coordinates
+    pixels: I64  # (A, 4) first row, last, first column, last; the last ones are not included
+
+
+def _seen_boxes(K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape: tuple[int, ...]) -> SeenBoxes:
+    T_box_camera = T_box_world @ T_world_camera
+    walls = _walls(sizes)
+    corners = walls[:, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]  # (A, 8, 3)
+    project = K @ inverse(T_box_camera)[:, :3]
+    shown = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
+    behind = (shown[..., 2] <= 0).all(axis=1)[:, None]
+    around = (shown[..., 2] <= NEAREST_M).any(axis=1)[:, None]  # some corners lie behind the camera, and the box may reach anywhere
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u_v = shown[..., :2] / shown[..., 2:]
+    whole = np.array(shape[::-1])
+    first = np.where(around, 0, np.clip(np.floor(u_v.min(axis=1)), 0, whole))
+    last = np.where(behind, 0, np.where(around, whole, np.clip(np.ceil(u_v.max(axis=1)), 0, whole)))
+    pixels = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=1).astype(np.int64)
+    ray = np.ascontiguousarray(T_box_camera[:, :3, :3] @ np.linalg.inv(K))
+    return SeenBoxes(ray, np.ascontiguousarray(T_box_camera[:, :3, 3]), walls, pixels)
+
+
+def _walls(sizes: F64) -> F64:
+    """Return the least and the greatest coordinates ``(..., 2, 3)`` of what moves with boxes ``(..., 3)``."""
+    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array([np.negative(AROUND_M), AROUND_M])
+    walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
+    return np.asarray(walls)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_box(ray, eye, low, high, left, top, out):
-    """Add the pixels that show one box to a part of a picture that begins at (left, top), by the slab method (Kay and Kajiya, 1986).
-
-    ``ray`` and ``eye`` are in the box's axes.
-    """
+def _add_box(ray, eye, walls, pixels, out):
+    """Add the pixels that show one box to the part of a picture that it may be seen in, by the slab method (Kay and Kajiya, 1986)."""
     for row in range(out.shape[0]):
-        v = top + row + 0.5
+        v = pixels[0] + row + 0.5
         for column in range(out.shape[1]):
-            u, near, far = left + column + 0.5, 0.0, np.inf
+            u, near, far = pixels[2] + column + 0.5, 0.0, np.inf
             for axis in range(3):
                 along = ray[axis, 0] * u + ray[axis, 1] * v + ray[axis, 2]
-                if along == 0.0:
-                    if not low[axis] < eye[axis] < high[axis]:
-                        far = -1.0
-                    continue
-                a, b = (low[axis] - eye[axis]) / along, (high[axis] - eye[axis]) / along
+                along = along if along != 0.0 else PARALLEL
+                a, b = (walls[0, axis] - eye[axis]) / along, (walls[1, axis] - eye[axis]) / along
                 near, far = max(near, min(a, b)), min(far, max(a, b))
-            if near < far:
-                out[row, column] = True
+            out[row, column] |= near < far
 
 
 def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
@@ -259,7 +279,7 @@ def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: 
     _, T_box_world, sizes = placed_boxes(actors, boxes)
     for T_box, size in zip(T_box_world, sizes, strict=True):
         with np.errstate(divide="ignore"):
-            hits = (np.stack(_walls(size)) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (rays @ T_box[:3, :3].T)
+            hits = (_walls(size) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (rays @ T_box[:3, :3].T)
         out |= np.maximum(hits.min(axis=0).max(axis=-1), 0) < hits.max(axis=0).min(axis=-1)
     return out
 
