@@ -156,7 +156,7 @@ def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
         for column in range(width):
             u0 = column + 0.5
             z = np.float64(depth[row, column])
-            z = z if z > 0 else INFINITY_M
+            z = z if z > 0 else np.float64(INFINITY_M)
             rz = z * (A[2, 0] * u0 + az) + b[2]
             u = (z * (A[0, 0] * u0 + ax) + b[0]) / rz
             v = (z * (A[1, 0] * u0 + ay) + b[1]) / rz
@@ -238,8 +238,8 @@ def _seen_boxes(K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape
     corners = walls[:, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]  # (A, 8, 3)
     project = K @ inverse(T_box_camera)[:, :3]
     shown = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
-    behind = (shown[..., 2] <= 0).all(axis=1)[:, None]
-    around = (shown[..., 2] <= NEAREST_M).any(axis=1)[:, None]  # some corners lie behind the camera, and the box may reach anywhere
+    behind = (shown[..., 2] <= 0).all(axis=1, keepdims=True)
+    around = (shown[..., 2] <= NEAREST_M).any(axis=1, keepdims=True)  # some corners lie behind the camera, and the box may reach anywhere
     with np.errstate(divide="ignore", invalid="ignore"):
         u_v = shown[..., :2] / shown[..., 2:]
     whole = np.array(shape[::-1])
