@@ -74,12 +74,12 @@ def main() -> None:
             print(f"| {low:.3g} to {high:.3g} | {share:.1%} | {words[0]} | {words[1]} |")
 
 
-def words_of(values: F64) -> str:
+def words_of(values: F64, digits: int = 1) -> str:
     """Return mean and half width of the interval."""
     if len(values) < 2:
         return "too few clips"
     high = t_interval(values, "clips").high
-    return f"{values.mean():.1f}" + ("" if high is None else f" ± {high - values.mean():.1f}")
+    return f"{values.mean():.{digits}f}" + ("" if high is None else f" ± {high - values.mean():.{digits}f}")
 
 
 if __name__ == "__main__":

@@ -288,16 +288,19 @@ def _shifted(sequence: PairSequence, clip: QualityClip, work: Work) -> U8:
 
 
 def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip:
-    """Return a sequence of pairs as a clip to measure on, its render replaced as ``--input`` says."""
+    """Return a sequence of pairs as a clip to measure on, its render replaced as ``--input`` says.
+
+    Whatever the picture is, recorded frames are carried into it by the depth of the degraded render, since pairs hold no other.
+    """
     clip = sequence.clip
     facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
+    recorded = open_references(sequence)
     if given == "render":
-        recorded = open_references(sequence)
         return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us, recorded)
     render, opacity = clip.rgb_gt, np.full_like(clip.opacity, 255)
     if given == "lost-resolution":
         render, opacity = lose_resolution(clip.rgb_gt, sequence.name)
-    return QualityClip(sequence.name, {**facts, "input": given}, render, clip.rgb_gt, opacity, clip.sdmap, clip.t_us)
+    return QualityClip(sequence.name, {**facts, "input": given}, render, clip.rgb_gt, opacity, clip.sdmap, clip.t_us, recorded)
 
 
 def lose_resolution(video: U8, name: str) -> tuple[U8, U8]:
