@@ -14,9 +14,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
 from alpasim_plugin.lab.bench.map_error import MapShift
 from alpasim_plugin.lab.training.reference_store import SequenceReferences
 from alpasim_plugin.lab.video_metrics import clip_quality
+from alpasim_plugin.lab.video_metrics.facts import JOD
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
 from alpasim_plugin.plugins.interfaces import Fixer
@@ -26,6 +28,9 @@ RAW = "3dgs"  # the variant of the unfixed render
 VERSION = 2  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
+
+
+JOD_EVERY = 20  # frames: the metric takes ten times as long as a fixer
 
 
 @dataclass(frozen=True)
@@ -128,16 +133,26 @@ def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> Var
     return VariantResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
 
 
-def measure(clip: QualityClip, variant: Variant, result: VariantResult, seed: int, networks: Mapping[str, ImageDistance]) -> dict[str, Any]:
+def measure(
+    clip: QualityClip,
+    variant: Variant,
+    result: VariantResult,
+    seed: int,
+    networks: Mapping[str, ImageDistance],
+    vdp: ColourVideoVDP | None = None,
+) -> dict[str, Any]:
     """Return the row of one clip under one variant, as `alpasim_plugin.lab.video_metrics.summary` takes it."""
     found = clip_quality(result.video, None if variant.label == TRUTH else clip.truth, networks)
+    values = dict(found.means)
+    if vdp is not None and variant.label != TRUTH:
+        values[JOD] = float(vdp.jod(result.video[::JOD_EVERY], clip.truth[::JOD_EVERY]).mean())
     return {
         "arm": variant.label,
         "clip": clip.name,
         "seed": seed,
         "frames": len(clip.t_us),
         "size": list(clip.truth.shape[1:3]),
-        "values": found.means,
+        "values": values,
         "identical": found.identical,
         "events": dict(result.events),
         # The first block is shorter and opens the history; where there are more, it does not count.

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -19,6 +20,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.io.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.lab.bench.colour_video_vdp import DISPLAY, ColourVideoVDP, load_metric
 from alpasim_plugin.lab.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row
 from alpasim_plugin.lab.bench.map_error import shifted_maps
 from alpasim_plugin.lab.bench.quality import QualityClip, Variant, measure, row_key, run_variant
@@ -29,6 +31,7 @@ from alpasim_plugin.lab.training.reference_store import open_references
 from alpasim_plugin.lab.training.seen_scene import scene_of
 from alpasim_plugin.lab.video_metrics.charts import plot_by_frame, plot_speed
 from alpasim_plugin.lab.video_metrics.dists import HEADS_SHA256 as DISTS_HEADS
+from alpasim_plugin.lab.video_metrics.facts import JOD
 from alpasim_plugin.lab.video_metrics.image_distance import DISTS, ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.lab.video_metrics.lpips import TRUNKS
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, shipped_weights
@@ -132,7 +135,8 @@ class QualityRun:
     @property
     def networks(self) -> tuple[tuple[str, str], ...]:
         """Perceptual distances that there are weights for, each with what identifies them."""
-        return tuple((name, identity(name, self.weights)) for name in available(self.weights))
+        by_weights = tuple((name, identity(name, self.weights)) for name in available(self.weights))
+        return by_weights if colour_video_vdp() is None else (*by_weights, (JOD, f"cvvdp {version('cvvdp')} {DISPLAY}"))
 
     @property
     def used_threads(self) -> int:
@@ -251,7 +255,8 @@ def finish(work: Work) -> dict[str, Any]:
     result = run_variant(clip, work.variant, fixer)
     for i in at:
         _write_png(work.picture_file(i), result.video[i])
-    row = measure(clip, work.variant, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
+    distances = {name: _network(name, work.weights) for name, _ in work.networks if name != JOD}
+    row = measure(clip, work.variant, result, work.seed, distances, colour_video_vdp() if len(distances) < len(work.networks) else None)
     if work.judging is not None:
         truth = None if work.variant.label == TRUTH else np.array(clip.truth)
         camera = camera_of(sequence, work.judging.scenes)
@@ -348,6 +353,12 @@ def _picture(path: Path) -> Any:
     if image is None:
         raise InputError(DOING, str(path), "no readable image", "remove the clip's row and start the command again")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+@cache
+def colour_video_vdp() -> ColourVideoVDP | None:
+    """Return the metric if it is installed."""
+    return load_metric()[0]
 
 
 @cache

@@ -7,6 +7,7 @@ from evaluators.metrics import METRICS, MetricInfo
 
 PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
 DRIFT = "drift_psnr_db"
+JOD = "cvvdp_jod"
 GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
 
 FACTS: dict[str, MetricInfo] = {
@@ -17,6 +18,7 @@ FACTS: dict[str, MetricInfo] = {
     "perceptual-syn": MetricInfo("", "lower", "mean", "perceptual distance by the feature network that comes with the package; not LPIPS"),
     "lpips_alex": MetricInfo("", "lower", "mean", "LPIPS v0.1 with AlexNet"),
     "lpips_vgg": MetricInfo("", "lower", "mean", "LPIPS v0.1 with VGG-16"),
+    JOD: MetricInfo("", "higher", "mean", "ColorVideoVDP of every 20th frame, just-objectionable differences; 10 is none to be seen"),
     "dists": MetricInfo("", "lower", "mean", "DISTS with VGG-16, full resolution"),
     WARP: MetricInfo("", "lower", "mean", "change from frame to frame beyond the video's own motion"),
     WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
