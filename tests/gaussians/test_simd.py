@@ -37,6 +37,11 @@ def _doubles(x, out):
 
 
 @njit
+def _lanes_with_bit(x, position):
+    return v.bits(v.has_bit(v.load(x, 0), position))
+
+
+@njit
 def _counter(cells):
     return v.fetch_add(cells, 1, 5), v.fetch_add(cells, 1, 7)
 
@@ -76,6 +81,12 @@ def test_doubles_round_once_on_the_way_to_single_precision():
     out = np.zeros(16, np.float32)
     _doubles(x, out)
     assert np.array_equal(out, (x * x - 0.25).astype(np.float32))
+
+
+def test_bits_of_integers_are_found_lane_by_lane():
+    x = np.random.default_rng(2).integers(-(2**31), 2**31, 16).astype(np.int32)
+    for position in (0, 5, 31):
+        assert _lanes_with_bit(x, position) == ((1 << np.arange(16))[(x >> position) & 1 == 1]).sum()
 
 
 def test_counter_returns_what_it_held():

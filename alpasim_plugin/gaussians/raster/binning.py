@@ -153,63 +153,108 @@ def _tile_box(records, at, tiles_x, tiles_y):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _tiles_in_row(records, at, row, tiles_x, left, right, rows):
-    """Return the first and one past the last tile of a row that a splat meets; only a box of several rows and columns has empty corners."""
-    if rows > 1 and right - left > 1:
-        left, right = _ellipse_columns(records, at, row, tiles_x)
-    return row * tiles_x + left, row * tiles_x + right
+def _is_large(left, right, top, bottom):
+    """Return whether a box has corners that its ellipse may leave empty: such splats are listed row by row, the others box by box."""
+    return bottom - top > 2 and right - left > 2
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _count_box(changes, stride, left, right, top, bottom):
+    """Count a box of tiles at its four corners; `tile_offsets` adds up from there."""
+    changes[top * stride + left] += 1
+    changes[top * stride + right] -= 1
+    changes[bottom * stride + left] -= 1
+    changes[bottom * stride + right] += 1
 
 
 @njit(cache=True, nogil=True)
-def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram):
-    """Copy records into depth order and count, per chunk of ``chunk_size`` splats, how many meet each tile."""
-    n_chunks = histogram.shape[0]
+def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, boxes, histogram):
+    """Copy records into depth order and count, per chunk of ``chunk_size`` splats, how many meet each tile.
+
+    ``boxes`` takes four int32 per splat, the tiles of its box. A row of ``histogram`` takes changes of the counts from tile to tile.
+    """
+    n_chunks, stride = histogram.shape[0], tiles_x + 1
     while True:
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= n_chunks:
             return
-        counts = histogram[chunk]
-        counts[:] = 0
+        changes = histogram[chunk]
+        changes[:] = 0
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
             v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
             source, at = (order[rank] & _LOW) * RECORD, rank * RECORD
             v.store(ordered, at, v.load(records, source))
             left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
-            for row in range(top, bottom):
-                first, end = _tiles_in_row(ordered, at, row, tiles_x, left, right, bottom - top)
-                for tile in range(first, end):
-                    counts[tile] += 1
+            boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3] = left, right, top, bottom
+            if _is_large(left, right, top, bottom):
+                for row in range(top, bottom):
+                    first, end = _ellipse_columns(ordered, at, row, tiles_x)
+                    _count_box(changes, stride, first, end, row, row + 1)
+            else:
+                _count_box(changes, stride, left, right, top, bottom)
 
 
 @njit(cache=True, nogil=True)
-def tile_offsets(histogram, starts):
-    """Turn the counts into each chunk's write positions; fill ``starts`` (tiles + 1); return the number of (splat, tile) pairs."""
-    n_chunks = histogram.shape[0]
-    total = 0
-    for tile in range(starts.shape[0] - 1):
-        starts[tile] = total
-        for chunk in range(n_chunks):
-            here = histogram[chunk, tile]
-            histogram[chunk, tile] = total
-            total += here
+def tile_offsets(histogram, tiles_x, starts):
+    """Turn the changes into each chunk's write positions; fill ``starts`` (tiles + 1); return the number of (splat, tile) pairs.
+
+    A row of ``histogram`` has a column and a row of tiles more than the image; positions lie at the tiles' own places in it.
+    """
+    n_chunks, stride = histogram.shape[0], tiles_x + 1
+    n_rows = (starts.shape[0] - 1) // tiles_x
+    for chunk in range(n_chunks):
+        counts = histogram[chunk]
+        for row in range(n_rows):
+            along = np.int64(0)
+            for at in range(row * stride, row * stride + tiles_x):
+                along += counts[at]
+                counts[at] = along + (counts[at - stride] if row > 0 else 0)
+    total = np.int64(0)
+    for row in range(n_rows):
+        for column in range(tiles_x):
+            starts[row * tiles_x + column] = total
+            for chunk in range(n_chunks):
+                here = histogram[chunk, row * stride + column]
+                histogram[chunk, row * stride + column] = total
+                total += here
     starts[starts.shape[0] - 1] = total
     return total
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _append(lists, position, tile, rank, present, nowhere):
+    """Append a rank to a tile's list, or write it to ``nowhere``: no branch, since nobody could foresee it."""
+    lists[position[tile] if present else nowhere] = rank
+    position[tile] += 1 if present else 0
+
+
 @njit(cache=True, nogil=True)
-def fill_tiles(cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists):
-    """Write each tile's list of ranks; chunks ascend and so do the ranks in a chunk, hence every list is in depth order."""
-    n_chunks = histogram.shape[0]
+def fill_tiles(cursor, count, chunk_size, ordered, boxes, tiles_x, histogram, pairs, lists):
+    """Write each tile's list of ranks; chunks ascend and so do the ranks in a chunk, hence every list is in depth order.
+
+    ``lists`` has room for one rank more than there are ``pairs``.
+    """
+    n_chunks, stride = histogram.shape[0], tiles_x + 1
     while True:
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= n_chunks:
             return
         position = histogram[chunk]
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
-            at = rank * RECORD
-            left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
+            left, right, top, bottom = boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3]
+            rows, columns = bottom - top, right - left
+            if rows <= 2 and columns <= 2:
+                tile = top * stride + left
+                some, wide = rows > 0, columns > 1
+                _append(lists, position, tile, rank, some & (columns > 0), pairs)
+                _append(lists, position, tile + 1, rank, some & wide, pairs)
+                _append(lists, position, tile + stride, rank, (rows > 1) & (columns > 0), pairs)
+                _append(lists, position, tile + stride + 1, rank, (rows > 1) & wide, pairs)
+                continue
+            large = _is_large(left, right, top, bottom)
             for row in range(top, bottom):
-                first, end = _tiles_in_row(ordered, at, row, tiles_x, left, right, bottom - top)
-                for tile in range(first, end):
+                if large:
+                    left, right = _ellipse_columns(ordered, rank * RECORD, row, tiles_x)
+                for tile in range(row * stride + left, row * stride + right):
                     lists[position[tile]] = rank
                     position[tile] += 1

@@ -14,16 +14,16 @@ is fixed. They are moments of ``h = alpha dL/dalpha`` over the whitened coordina
 
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
-# Numba's decorators are untyped.
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from alpasim_plugin.gaussians.constants import ALPHA_MAX, PEAK, RECORD, TILE, B, G, R, U, V, Z
+from alpasim_plugin.gaussians.constants import ALPHA_MAX, PEAK, RECORD, TILE, B, G, R, Z
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.raster.raster_kernels import (
+    CHUNK,
     CUT,
     STATE,
     STATE_B,
@@ -31,13 +31,14 @@ from alpasim_plugin.gaussians.raster.raster_kernels import (
     STATE_G,
     STATE_R,
     STATE_T,
-    block_coordinates,
+    block_centres,
     composite_tile,
     falloff,
     pixel_of,
     place_of,
     start_tile,
     touched_blocks,
+    whitened,
 )
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3, sh_terms
 
@@ -72,17 +73,17 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
         depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres.
     """
     state = np.empty(16 * STATE, np.float32)
-    last = np.empty(256, np.float32)
+    last, near, masks = np.empty(256, np.float32), np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int32)
     height, width = alpha.shape
     while True:
         tile = v.fetch_add(cursor, 0, 1)
         if tile >= starts.shape[0] - 1:
             return
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        live = start_tile(state, tile_x, tile_y, width, height)
-        last[:] = _f(-1.0)
         x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
-        composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, last)
+        live = start_tile(state, x0, y0, width, height)
+        last[:] = _f(-1.0)
+        composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, last, near, masks)
         for block in range(16):
             at = (tile * 16 + block) * KEPT
             v.store(kept, at + KEPT_T, v.absolute(v.load(state, block * STATE + STATE_T)))
@@ -125,8 +126,7 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
     for i in range(end - 1, -1, -1):
         v.prefetch(records, np.int64(lists[first + max(i - 8, 0)]) * RECORD)
         at = np.int64(lists[first + i]) * RECORD
-        dx, dy = x0 - records[at + U], y0 - records[at + V]
-        todo = touched_blocks(records, at, dx, dy) & live
+        todo = touched_blocks(records, at, x0, y0) & live
         if todo == 0:
             continue
         place, peak = v.splat(_f(i)), v.splat(records[at + PEAK])
@@ -137,12 +137,13 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             block = v.lowest_bit(todo)
             todo &= todo - 1
             base = block * _BACK
-            s, t = block_coordinates(records, at, dx, dy, block)
-            y = v.fnma(s, s, v.fnma(t, t, peak))
-            drawn = (y >= v.splat(CUT)) & (place <= v.load(pixels, base + KEPT_LAST))
+            x, y = block_centres(x0, y0, block)
+            s, t = whitened(records, at, x, y)
+            exponent = v.fnma(s, s, v.fnma(t, t, peak))
+            drawn = (exponent >= v.splat(CUT)) & (place <= v.load(pixels, base + KEPT_LAST))
             if v.bits(drawn) == 0:
                 continue
-            full = v.select(drawn, falloff(y), zero)
+            full = v.select(drawn, falloff(exponent), zero)
             alpha = v.minimum(full, v.splat(_ALPHA_MAX))
             inverse = one / (one - alpha)
             before = v.load(pixels, base + KEPT_T) * inverse

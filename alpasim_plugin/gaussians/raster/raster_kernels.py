@@ -1,7 +1,9 @@
 """Composite the splats of each tile, sixteen pixels at a time.
 
-A tile of 16 x 16 pixels is sixteen blocks of 4 x 4. For each splat one vector operation over the block centres tells which blocks it can
-touch; each touched block is one vector of pixels. Blocks whose pixels are all finished are left out, and a tile ends when no block is left.
+A tile of 16 x 16 pixels is sixteen blocks of 4 x 4. A tile's list is taken in chunks: for each splat of a chunk one vector operation over
+the block centres tells which blocks it can touch; then each block blends the splats that touch it, one after the other, with its pixels in
+registers. So the innermost loop has no branch that depends on the image, and its end is hard to foresee once per 64 splats only. A block
+whose pixels are all finished is left out, and a tile ends when no block is left.
 
 The exponential is ``alpha = o exp(-q^2/2) = P(y)^8`` with ``y = peak - s^2 - t^2`` in [-0.5, 0.5] wherever alpha reaches the cut, and P a
 polynomial of degree 5 for ``2^(y - 0.5)``: relative error below 2e-6, without range reduction.
@@ -47,6 +49,7 @@ _STOP = _f(TRANSMITTANCE_STOP)
 # Columns of a block's state, sixteen pixels each. A finished pixel keeps its transmittance with the sign turned.
 STATE_T, STATE_R, STATE_G, STATE_B, STATE_D = 0, 16, 32, 48, 64
 STATE = 80
+CHUNK = 256  # splats of a tile that are taken at once, a multiple of 64
 
 
 @njit(cache=True, nogil=True)
@@ -62,43 +65,52 @@ def place_of(row, column):
 
 
 @njit(cache=True, nogil=True)
-def start_tile(state, tile_x, tile_y, width, height):
+def block_centres(x0, y0, block):
+    """Return the pixel centres of a tile's block, ``x`` and ``y``; ``x0, y0`` is that of the tile's first pixel."""
+    zero, one = _f(0.0), _f(1.0)
+    x = v.splat(x0 + _f(4.0) * _f(block & 3)) + v.lane_pattern(one, zero)
+    y = v.splat(y0 + _f(4.0) * _f(block >> 2)) + v.lane_pattern(zero, one)
+    return x, y
+
+
+@njit(cache=True, nogil=True)
+def start_tile(state, x0, y0, width, height):
     """Reset the state of a tile and return the bit mask of blocks that hold a pixel of the image."""
     live = 0
-    state[:] = _f(0.0)
+    zero = v.splat(_f(0.0))
     for block in range(16):
-        for pixel in range(16):
-            x, y = pixel_of(tile_x, tile_y, block, pixel)
-            inside = x < width and y < height
-            state[block * STATE + STATE_T + pixel] = _f(1.0) if inside else _f(-1.0)
-            if inside:
-                live |= 1 << block
+        base = block * STATE
+        x, y = block_centres(x0, y0, block)
+        inside = (x < v.splat(_f(width))) & (y < v.splat(_f(height)))
+        v.store(state, base + STATE_T, v.select(inside, v.splat(_f(1.0)), v.splat(_f(-1.0))))
+        v.store(state, base + STATE_R, zero)
+        v.store(state, base + STATE_G, zero)
+        v.store(state, base + STATE_B, zero)
+        v.store(state, base + STATE_D, zero)
+        if v.bits(inside) != 0:
+            live |= 1 << block
     return live
 
 
 @njit(cache=True, nogil=True)
-def touched_blocks(records, at, dx, dy):
-    """Return the bit mask of the sixteen blocks that a splat can touch; ``dx, dy`` is the tile's first pixel from the splat's centre."""
-    nil, four, middle = _f(0.0), _f(4.0), _f(1.5)
-    l11, l12, l22 = records[at + L11], records[at + L12], records[at + L22]
-    s = v.splat(l11 * dx + l12 * dy + middle * (l11 + l12)) + v.lane_pattern(four * l11, four * l12)
-    t = v.splat(l22 * dy + middle * l22) + v.lane_pattern(nil, four * l22)
+def touched_blocks(records, at, x0, y0):
+    """Return the bit mask of the sixteen blocks that a splat can touch; ``x0, y0`` is the centre of the tile's first pixel."""
+    zero, four, middle = _f(0.0), _f(4.0), _f(1.5)
+    x = v.splat(x0 + middle - records[at + U]) + v.lane_pattern(four, zero)
+    y = v.splat(y0 + middle - records[at + V]) + v.lane_pattern(zero, four)
+    s = v.fma(v.splat(records[at + L11]), x, v.splat(records[at + L12]) * y)
+    t = v.splat(records[at + L22]) * y
     touched = v.fma(s, s, t * t) <= v.splat(records[at + BLOCK_REACH])
-    x = v.splat(dx + middle) + v.lane_pattern(four, nil)
-    y = v.splat(dy + middle) + v.lane_pattern(nil, four)
     touched = touched & (v.absolute(x) <= v.splat(records[at + RADIUS_X] + middle))
     touched = touched & (v.absolute(y) <= v.splat(records[at + RADIUS_Y] + middle))
     return v.bits(touched)
 
 
 @njit(cache=True, nogil=True)
-def block_coordinates(records, at, dx, dy, block):
-    """Return ``s`` and ``t`` at the sixteen pixels of a block: the splat's exponent is ``peak - s^2 - t^2``."""
-    l11, l12, l22 = records[at + L11], records[at + L12], records[at + L22]
-    column, row = _f(_f(4.0) * _f(block & 3)), _f(_f(4.0) * _f(block >> 2))
-    s = v.splat(l11 * dx + l12 * dy + l11 * column + l12 * row) + v.lane_pattern(l11, l12)
-    t = v.splat(l22 * dy + l22 * row) + v.lane_pattern(_f(0.0), l22)
-    return s, t
+def whitened(records, at, x, y):
+    """Return ``s`` and ``t`` at sixteen pixel centres: the splat's exponent is ``peak - s^2 - t^2``."""
+    dx, dy = x - v.splat(records[at + U]), y - v.splat(records[at + V])
+    return v.fma(v.splat(records[at + L11]), dx, v.splat(records[at + L12]) * dy), v.splat(records[at + L22]) * dy
 
 
 @njit(cache=True, nogil=True)
@@ -115,48 +127,77 @@ def falloff(y):
 
 
 @njit(cache=True, nogil=True)
-def composite_tile(lists, start, end, records, x0, y0, state, live, last):
+def _blend_block(block, x, y, first, masks, near, state, last):
+    """Blend the splats of a chunk that touch a block; returns the position of the splat that finished it, or -1."""
+    zero, cut, largest, stop = v.splat(_f(0.0)), v.splat(CUT), v.splat(_ALPHA_MAX), v.splat(_STOP)
+    base = block * STATE
+    through = v.load(state, base + STATE_T)
+    red, green, blue = v.load(state, base + STATE_R), v.load(state, base + STATE_G), v.load(state, base + STATE_B)
+    depth = v.load(state, base + STATE_D)
+    finished = -1
+    for word in range(CHUNK // 64):
+        touching = 0
+        for part in range(4):
+            touching |= v.bits(v.has_bit(v.load(masks, word * 64 + part * 16), block)) << (part * 16)
+        while touching != 0:
+            place = word * 64 + v.lowest_bit(touching)
+            touching &= touching - 1
+            at = place * RECORD
+            s, t = whitened(near, at, x, y)
+            exponent = v.fnma(s, s, v.fnma(t, t, v.splat(near[at + PEAK])))
+            drawn = exponent >= cut
+            alpha = v.select(drawn, v.minimum(falloff(exponent), largest), zero)
+            after = v.fnma(through, alpha, through)
+            goes_on = after > stop
+            weight = v.select(goes_on, through * alpha, zero)
+            through = v.select(goes_on, after, v.negative(v.absolute(through)))
+            red = v.fma(weight, v.splat(near[at + R]), red)
+            green = v.fma(weight, v.splat(near[at + G]), green)
+            blue = v.fma(weight, v.splat(near[at + B]), blue)
+            depth = v.fma(weight, v.splat(near[at + Z]), depth)
+            if last is not None:
+                v.store(last, block * 16, v.select(goes_on & drawn, v.splat(_f(first + place)), v.load(last, block * 16)))
+            if v.bits(through > zero) == 0:
+                finished = first + place
+                touching = 0
+        if finished >= 0:
+            break
+    v.store(state, base + STATE_T, through)
+    v.store(state, base + STATE_R, red)
+    v.store(state, base + STATE_G, green)
+    v.store(state, base + STATE_B, blue)
+    v.store(state, base + STATE_D, depth)
+    return finished
+
+
+@njit(cache=True, nogil=True)
+def composite_tile(lists, start, end, records, x0, y0, state, live, last, near, masks):
     """Blend a tile's splats in order; ``x0, y0`` is the centre of its first pixel. Returns how many splats were looked at.
 
-    ``last`` is None, or takes per pixel (sixteen a block) the position in the tile's list of the last splat drawn there.
+    ``last`` is None, or takes per pixel (sixteen a block) the position in the tile's list of the last splat drawn there. ``near`` and
+    ``masks`` are room for a chunk of splats: their records, and which blocks they touch.
     """
-    zero = v.splat(_f(0.0))
-    for i in range(start, end):
-        v.prefetch(records, np.int64(lists[min(i + 8, end - 1)]) * RECORD)
-        at = np.int64(lists[i]) * RECORD
-        dx, dy = x0 - records[at + U], y0 - records[at + V]
-        todo = touched_blocks(records, at, dx, dy) & live
-        if todo == 0:
-            continue
-        peak = v.splat(records[at + PEAK])
-        red, green, blue, depth = v.splat(records[at + R]), v.splat(records[at + G]), v.splat(records[at + B]), v.splat(records[at + Z])
+    looked_at = 0
+    for first in range(start, end, CHUNK):
+        size = min(CHUNK, end - first)
+        for i in range(size):
+            v.prefetch(records, np.int64(lists[min(first + i + 16, end - 1)]) * RECORD)
+            at = np.int64(lists[first + i]) * RECORD
+            v.store(near, i * RECORD, v.load(records, at))
+            masks[i] = touched_blocks(records, at, x0, y0)
+        for i in range(size, CHUNK):
+            masks[i] = 0
+        todo = live
         while todo != 0:
             block = v.lowest_bit(todo)
             todo &= todo - 1
-            s, t = block_coordinates(records, at, dx, dy, block)
-            y = v.fnma(s, s, v.fnma(t, t, peak))
-            drawn = y >= v.splat(CUT)
-            if v.bits(drawn) == 0:
-                continue
-            alpha = v.select(drawn, v.minimum(falloff(y), v.splat(_ALPHA_MAX)), zero)
-            base = block * STATE
-            before = v.load(state, base + STATE_T)
-            after = v.fnma(before, alpha, before)
-            goes_on = after > v.splat(_STOP)
-            weight = v.select(goes_on, before * alpha, zero)
-            after = v.select(goes_on, after, v.negative(v.absolute(before)))
-            v.store(state, base + STATE_T, after)
-            v.store(state, base + STATE_R, v.fma(weight, red, v.load(state, base + STATE_R)))
-            v.store(state, base + STATE_G, v.fma(weight, green, v.load(state, base + STATE_G)))
-            v.store(state, base + STATE_B, v.fma(weight, blue, v.load(state, base + STATE_B)))
-            v.store(state, base + STATE_D, v.fma(weight, depth, v.load(state, base + STATE_D)))
-            if last is not None:
-                place = v.splat(_f(i - start))
-                v.store(last, block * 16, v.select(goes_on & drawn, place, v.load(last, block * 16)))
-            if v.bits(after > zero) == 0:
+            x, y = block_centres(x0, y0, block)
+            finished = _blend_block(block, x, y, first - start, masks, near, state, last)
+            if finished >= 0:
                 live &= ~(1 << block)
+                looked_at = max(looked_at, finished + 1)
         if live == 0:
-            return i + 1 - start
+            return looked_at
     return end - start
 
 
@@ -183,7 +224,7 @@ def _finish_tile(state, tile_x, tile_y, background, rgb, alpha, depth):
 @njit(cache=True, nogil=True)
 def raster_tiles(cursor, tiles_x, starts, lists, records, background, rgb, alpha, depth):
     """Render tiles until none is left; called by each thread. ``cursor[0]`` is the next tile, ``cursor[1]`` sums the splats looked at."""
-    state = np.empty(16 * STATE, np.float32)
+    state, near, masks = np.empty(16 * STATE, np.float32), np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int32)
     height, width = alpha.shape
     n_tiles = starts.shape[0] - 1
     while True:
@@ -191,8 +232,8 @@ def raster_tiles(cursor, tiles_x, starts, lists, records, background, rgb, alpha
         if tile >= n_tiles:
             return
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        live = start_tile(state, tile_x, tile_y, width, height)
         x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
-        looked_at = composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, None)
+        live = start_tile(state, x0, y0, width, height)
+        looked_at = composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, None, near, masks)
         v.fetch_add(cursor, 1, looked_at)
         _finish_tile(state, tile_x, tile_y, background, rgb, alpha, depth)

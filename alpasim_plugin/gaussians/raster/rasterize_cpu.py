@@ -160,16 +160,17 @@ def list_per_tile(
     ordered = buffers.get("ordered", count * RECORD, np.float32)
     # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
     chunk_size = max(2048, -(-count // 64))
-    n_chunks, n_tiles = -(-count // chunk_size), tiles_x * tiles_y
-    histogram = buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
-    starts = np.empty(n_tiles + 1, np.int64)
+    n_chunks, room = -(-count // chunk_size), (tiles_x + 1) * (tiles_y + 2) + 1
+    histogram = buffers.get("histogram", n_chunks * room, np.int64)[: n_chunks * room].reshape(n_chunks, room)
+    boxes = buffers.get("boxes", 4 * count, np.int32)
+    starts = np.empty(tiles_x * tiles_y + 1, np.int64)
     cursor = np.zeros(2, np.int64)
     workers = threads if count > WORTH_THREADS else 1
-    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram)
-    pairs = int(tile_offsets(histogram, starts))
-    lists = buffers.get("lists", pairs, np.int32)
+    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, boxes, histogram)
+    pairs = int(tile_offsets(histogram, tiles_x, starts))
+    lists = buffers.get("lists", pairs + 1, np.int32)
     cursor[:] = 0
-    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists)
+    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, boxes, tiles_x, histogram, pairs, lists)
     return TileLists(tiles_x, order, ordered, starts, lists, pairs)
 
 

@@ -24,7 +24,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
 _I32 = ir.IntType(32)
-_ELEMENTS = {"f32": ir.FloatType(), "f64": ir.DoubleType(), "bool": ir.IntType(1)}
+_ELEMENTS = {"f32": ir.FloatType(), "f64": ir.DoubleType(), "bool": ir.IntType(1), "i32": _I32}
 _VECTORS = {name: ir.VectorType(element, LANES) for name, element in _ELEMENTS.items()}
 
 
@@ -46,9 +46,16 @@ class VectorTypeBool(types.Type):
     element = "bool"
 
 
+class VectorTypeI32(types.Type):
+    """Sixteen int32 values."""
+
+    element = "i32"
+
+
 F32X16 = VectorTypeF32("f32x16")
 F64X16 = VectorTypeF64("f64x16")
 MASK16 = VectorTypeBool("mask16")
+I32X16 = VectorTypeI32("i32x16")
 _FLOAT_VECTORS = (F32X16, F64X16)
 
 
@@ -59,12 +66,12 @@ def _register(numba_type: type) -> None:
             super().__init__(manager, front_end_type, _VECTORS[numba_type.element])  # type: ignore[attr-defined]
 
 
-for _type in (VectorTypeF32, VectorTypeF64, VectorTypeBool):
+for _type in (VectorTypeF32, VectorTypeF64, VectorTypeBool, VectorTypeI32):
     _register(_type)
 
 
 def _vector_of(scalar: Any) -> Any:
-    return {types.float32: F32X16, types.float64: F64X16}.get(scalar)
+    return {types.float32: F32X16, types.float64: F64X16, types.int32: I32X16}.get(scalar)
 
 
 def _broadcast(builder, value):
@@ -238,6 +245,18 @@ def bits(typingctx, mask):
         return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
 
     return types.int64(mask), codegen
+
+
+@intrinsic
+def has_bit(typingctx, a, position):
+    """Return a mask of the lanes of an int32 vector in which the bit at ``position`` is set."""
+
+    def codegen(context, builder, sig, args):
+        bit = builder.shl(_I32(1), builder.trunc(args[1], _I32))
+        both = builder.and_(args[0], _broadcast(builder, bit))
+        return builder.icmp_unsigned("!=", both, ir.Constant(_VECTORS["i32"], None))
+
+    return MASK16(I32X16, types.int64), codegen
 
 
 @intrinsic
