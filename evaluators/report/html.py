@@ -27,13 +27,13 @@ from evaluators.metrics.outcomes import OUTCOMES, has_ended, in_words, outcomes_
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
-from evaluators.report.charts import drift_charts, forest, speed_against_error
+from evaluators.report.charts import forest, speed_against_error
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, fixed, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
-from evaluators.report.rollouts import read_series, rollout_block
+from evaluators.report.rollouts import drift_charts, read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 from evaluators.report.verdict import decision_section, gate_section
