@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 import shutil
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from jinja2 import Environment
 
 import evaluators.report.html as html
 from alpasim_plugin.core.errors import InfrastructureError
@@ -256,3 +258,30 @@ def test_ticks_are_round_few_and_inside(low: float, high: float) -> None:
         assert 2 <= len(ticks) <= 10
         assert all(low - 1e-12 <= value <= high + 1e-12 for value, _ in ticks)
         assert all(float(text.replace("\u2212", "-")) == pytest.approx(value, abs=1e-12) for value, text in ticks)
+
+
+def test_a_template_is_compiled_once_and_again_where_its_file_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(html.CompiledBeside, "folder", tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    compiled: list[str] = []
+    real = Environment.compile
+    monkeypatch.setattr(Environment, "compile", lambda self, source, name, *rest: compiled.append(name) or real(self, source, name, *rest))
+
+    def rendered() -> str:
+        html.environment_of.cache_clear()
+        return html.environment_of("evaluators.report").get_template("macros.html.j2").render()
+
+    first = rendered()
+    assert rendered() == first
+    assert compiled == ["macros.html.j2"]
+    (kept,) = tmp_path.iterdir()
+    whole = kept.read_bytes()
+    for damaged in (b"", whole[:-1], whole[:-1] + b"x", b"x" + whole[1:]):
+        kept.write_bytes(damaged)
+        compiled.clear()
+        assert rendered() == first
+        assert compiled == ["macros.html.j2"]
+        assert kept.read_bytes() == whole
+    monkeypatch.setattr(html.CompiledBeside, "folder", kept / "no folder")
+    assert rendered() == first
+    html.environment_of.cache_clear()
