@@ -8,10 +8,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import CubicSpline, arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import build, unidentified
@@ -135,7 +134,7 @@ def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
     at = np.arange(0.0, max(float(s[-1]), spacing_m) + 1e-9, spacing_m)
     if keep.sum() < 3:
         return resample(points, at)
-    return np.asarray(scipy.interpolate.CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1])))
+    return CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1]))
 
 
 def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> Path:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from alpasim_plugin.runtime.execute import Threads
-from alpasim_plugin.runtime.plan import RunPlan
 from evaluators.metrics.outcomes import NO_OUTCOME, event_words
 from evaluators.report.numbers import plural
+
+if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
+    from alpasim_plugin.runtime.execute import Threads
+    from alpasim_plugin.runtime.plan import RunPlan
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
 MAX_LINES = 1000

@@ -5,8 +5,11 @@ Quaternions are ``wxyz``; ``T_a_b`` maps coordinates in b to coordinates in a; a
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
@@ -173,6 +176,51 @@ def resample(line: F64, s_m: npt.ArrayLike) -> F64:
     keep = np.concatenate([[True], np.diff(s) > 0])
     at = np.asarray(s_m, dtype=np.float64)
     return np.stack([np.interp(at, s[keep], line[keep, d]) for d in range(line.shape[1])], axis=-1)
+
+
+class CubicSpline:
+    """The cubic spline through points over a parameter, whose ends are not knots; through three points a parabola, through two a line.
+
+    It is ``scipy.interpolate.CubicSpline`` to the last bit, without its checks; its module takes longer to load than a drive to begin.
+
+    Args:
+        at: ``(N,)`` increasing, N at least two.
+        points: ``(N, D)``.
+    """
+
+    def __init__(self, at: F64, points: F64) -> None:
+        n, step = len(at), np.diff(at)
+        over = step[:, None]
+        slope = np.diff(points, axis=0) / over
+        if n == 2:
+            tangent = np.concatenate([slope, slope])
+        elif n == 3:
+            matrix = np.array([[1.0, 1.0, 0.0], [step[1], 2 * (step[0] + step[1]), step[0]], [0.0, 1.0, 1.0]])
+            right = np.stack([2 * slope[0], 3 * (step[0] * slope[1] + step[1] * slope[0]), 2 * slope[1]])
+            tangent = scipy.linalg.solve(matrix, right)
+        else:
+            right = np.empty_like(points)
+            right[1:-1] = 3 * (over[1:] * slope[:-1] + over[:-1] * slope[1:])
+            first, last = at[2] - at[0], at[-1] - at[-3]
+            right[0] = ((step[0] + 2 * first) * step[1] * slope[0] + step[0] ** 2 * slope[1]) / first
+            right[-1] = (step[-1] ** 2 * slope[-2] + (2 * last + step[-1]) * step[-2] * slope[-1]) / last
+            diagonal = np.concatenate([[step[1]], 2 * (step[:-1] + step[1:]), [step[-2]]])
+            below, above = np.concatenate([step[1:], [last]]), np.concatenate([[first], step[:-1]])
+            tangent = scipy.linalg.lapack.dgtsv(below, diagonal, above, right)[3]
+        bend = (tangent[:-1] + tangent[1:] - 2 * slope) / over
+        self._at = at
+        self._terms = points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over  # (N - 1, D) each
+
+    def __call__(self, at: F64, derivative: int = 0) -> F64:
+        """Return points ``(M, D)``, or their first or second derivative, at ``(M,)``; outside, those of the outermost piece."""
+        i = np.clip(np.searchsorted(self._at, at, side="right") - 1, 0, len(self._at) - 2)
+        along = (at - self._at[i])[:, None]
+        total, power = np.zeros((len(at), self._terms[0].shape[1])), np.ones_like(along)
+        for k, term in enumerate(self._terms):
+            if k >= derivative:
+                total = total + term[i] * power * float(math.perm(k, derivative))
+                power = power * along
+        return total
 
 
 def project(line: F64, xy: F64) -> tuple[float, float]:

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.run_folder.check import Inspection, command_of, inspect_run, prepare_reading, restore_run
 from alpasim_plugin.run_folder.schema import DOING, REPORTS, RUN_INFO
 from alpasim_plugin.run_folder.writer import writing
-from alpasim_plugin.runtime.certificate import Certify
-from alpasim_plugin.runtime.plan import RunPlan, make_plan, options_of, ref_of, refuse_commands
-from alpasim_plugin.runtime.run import Progress, execute_run, finish_run
+
+if TYPE_CHECKING:  # whoever only reads a run loads neither the loop nor its kernels, unless the run is damaged
+    from alpasim_plugin.runtime.certificate import Certify
+    from alpasim_plugin.runtime.plan import RunPlan
+    from alpasim_plugin.runtime.run import Progress
 
 
 def use_run(root: Path, say: Callable[[str], None]) -> None:
@@ -25,6 +27,8 @@ def use_run(root: Path, say: Callable[[str], None]) -> None:
 def remake_tables(found: Inspection) -> None:
     """Write the tables, reports and contents of a run again from its manifests; the caller holds the lock."""
     manifests, more = restore_run(found)
+    from alpasim_plugin.runtime.run import finish_run
+
     with parsing(DOING, found.root, "make the run again", "manifests from which no table can be made"):
         finish_run(found.root, manifests, more, (found.root / REPORTS[0]).exists())
 
@@ -42,6 +46,8 @@ def repair_run(found: Inspection, workers: int | None, progress: Progress, wait:
         InputError: The scenario, a part or the version has changed since the run, or the folder is not that of a run.
         InfrastructureError: Another process writes the folder, or it is read-only.
     """
+    from alpasim_plugin.runtime.run import execute_run
+
     if found.is_remakable:
         with writing(found.root, wait, progress.noticed):
             remake_tables(inspect_run(found.root, full=True))
@@ -66,6 +72,8 @@ def plan_of_run(info: Mapping[str, Any]) -> RunPlan:
     Raises:
         InputError: A scenario or a part is not there any more.
     """
+    from alpasim_plugin.runtime.plan import make_plan, options_of, ref_of, refuse_commands
+
     refs = []
     for name, scene in info["scenes"].items():
         ref = scene.get("ref")

@@ -7,12 +7,10 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from alpasim_plugin.core.errors import InputError
@@ -32,7 +30,7 @@ from alpasim_plugin.viewer.cells import (
 from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.opening import Run, read_run
 from evaluators.report.flips import FlipKey
-from evaluators.report.html import asset
+from evaluators.report.html import asset, environment_of
 from evaluators.report.numbers import plural
 
 MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
@@ -178,17 +176,11 @@ def render(index: str, documents: Mapping[str, str], live: bool = False) -> str:
 
 def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
     """Fill a template of a page that holds its scripts and styles and allows no others."""
-    environment = _environment()
+    environment = environment_of("alpasim_plugin.viewer", "evaluators.report")  # colours are the report's
     script = "\n".join(asset(environment, name) for name in scripts)
     style = "\n".join(asset(environment, name) for name in styles)
     own = {"style": Markup(style), "style_hash": _sha256(style), "script": Markup(script), "script_hash": _sha256(script)}
     return environment.get_template(template).render(**own, **values)
-
-
-@cache
-def _environment() -> Environment:
-    loader = ChoiceLoader([PackageLoader("alpasim_plugin.viewer"), PackageLoader("evaluators.report")])  # colours are the report's
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 
 def _sha256(text: str) -> str:

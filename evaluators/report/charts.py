@@ -1,58 +1,37 @@
-"""The charts of a report: drift over time, the forest of paired differences, and speed against error, drawn in one style."""
+"""The charts of a report: axes that draw themselves as SVG in the page's colours, and drift, paired differences and speed on them."""
 
 from __future__ import annotations
 
-import io
-import re
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-import matplotlib as mpl
 import numpy as np
-from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from markupsafe import Markup, escape
 
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.run_folder.rows import Rollout, Series
 from alpasim_plugin.run_folder.shapes import pair_tables
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
 from evaluators.report.numbers import LEAST_SPAN, finite, interval
-from evaluators.report.rollouts import events_of
 
 N_COLOURS = 8
-SIZE_IN = (4.6, 2.7)  # about 440 x 260 CSS pixels: legible at its own size on a phone
-DASHES: tuple[str | tuple[int, tuple[float, ...]], ...] = ("solid", (0, (5.0, 2.0)), (0, (1.5, 1.5)), (0, (6.0, 2.0, 1.5, 2.0)))
-VARIANT = [f"#01{i:02x}a1" for i in range(N_COLOURS)]  # stand-ins, found again in the SVG
-INK, MUTED, GRID = "#0201a1", "#0202a1", "#0203a1"
-VARIABLES = {colour: f"var(--variant-{i})" for i, colour in enumerate(VARIANT)}
-VARIABLES |= {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
-N_BINS = 60
-
-RC = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "simrun",
-    "font.size": 10,
-    "text.color": INK,
-    "axes.labelcolor": MUTED,
-    "axes.edgecolor": GRID,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "grid.color": GRID,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
-    "lines.linewidth": 1.8,
-}
+SIZE_PT = (331.2, 194.4)  # about 440 x 260 CSS pixels: legible at its own size on a phone
+FONT_PT, LETTER_PT, LINE_PT = 10.0, 6.0, 12.0  # the page's font: its size, the width and height of a letter
+DASHES = ("", "9 3.6", "2.7 2.7", "10.8 2.7 2.7 3.6")
+VARIANT = [f"var(--variant-{i})" for i in range(N_COLOURS)]
+INK, MUTED, GRID = "var(--ink)", "var(--muted)", "var(--line)"
+STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)  # between ticks, times a power of ten
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
+SHAPES = {  # corners of markers of size 1 around their middle, y down
+    "s": "-.5 -.5 .5 -.5 .5 .5 -.5 .5", "D": "0 -.7 .7 0 0 .7 -.7 0", "^": "0 -.5 .5 .5 -.5 .5", "v": "0 .5 .5 -.5 -.5 -.5",
+    "P": "-.17 -.5 .17 -.5 .17 -.17 .5 -.17 .5 .17 .17 .17 .17 .5 -.17 .5 -.17 .17 -.5 .17 -.5 -.17 -.17 -.17",
+    "X": "-.5 -.25 -.25 -.5 0 -.25 .25 -.5 .5 -.25 .25 0 .5 .25 .25 .5 0 .25 -.25 .5 -.5 .25 -.25 0",
+    "p": "0 -.5 .48 -.15 .29 .4 -.29 .4 -.48 -.15",
+}  # fmt: skip
+Values = Sequence[float] | F64
+Tick = tuple[float, str]
 
 
 @dataclass(frozen=True)
@@ -82,120 +61,185 @@ class Curve:
     high: F64 | None = None
 
 
-def new_axes(
-    height_in: float = SIZE_IN[1], left_in: float = 0.78, bottom_in: float = 0.5, width_in: float = SIZE_IN[0]
-) -> tuple[Figure, Axes]:
-    """Return a figure with one set of axes and fixed margins.
+class Axes:
+    """One set of axes with fixed margins. Things are added in data's units, and `svg` draws all of them where the limits then are.
 
-    Margins are given, not measured: measuring text takes two thirds of the time of a chart, and the page has a font of its own.
+    Margins are given, not measured: the page has a font of its own.
 
     Args:
-        height_in: Height of the figure, inches.
-        left_in: Room for the tick labels and the label of the y axis, inches.
-        bottom_in: Room for those of the x axis, inches.
-        width_in: Width of the figure, inches.
+        height_pt: Height of the picture, points.
+        left_pt: Room for the tick labels and the label of the y axis.
+        bottom_pt: Room for those of the x axis.
+        width_pt: Width of the picture.
+        grid: Axes whose ticks have lines across.
+
+    Attributes:
+        limits: Of x and of y; None: what was added, with a twentieth of room on either side.
+        ticks: Of x and of y; None: round numbers.
+        labels: Of x and of y.
+        log: The x axis is logarithmic.
+        tilted: The tick labels of x are written aslant.
+        spine: The line of the y axis is drawn.
+        room: Share of what was added that is left free on either side, x and y.
     """
-    figure = Figure(figsize=(width_in, height_in))
-    box = (left_in / width_in, bottom_in / height_in, 1.0 - (left_in + 0.08) / width_in, 1.0 - (bottom_in + 0.1) / height_in)
-    return figure, figure.add_axes(box)
+
+    def __init__(
+        self, height_pt: float = SIZE_PT[1], left_pt: float = 56.0, bottom_pt: float = 36.0, width_pt: float = SIZE_PT[0], grid: str = "xy"
+    ) -> None:
+        self.size = width_pt, height_pt
+        self.box = left_pt, 7.2, width_pt - 5.8, height_pt - bottom_pt  # left, top, right, bottom
+        self.limits: list[tuple[float, float] | None] = [None, None]
+        self.ticks: list[Sequence[Tick] | None] = [None, None]
+        self.labels, self.room = ["", ""], [0.05, 0.05]
+        self.log, self.tilted, self.spine = False, False, True
+        self.named: list[tuple[float, float, float, float]] = []  # what names cover: left, right, top, bottom, points
+        self._grid = grid
+        self._seen: tuple[list[float], list[float]] = ([], [])
+        self._drawn: list[tuple[str, Any]] = []
+
+    def line(self, x: Values, y: Values, colour: str, width: float = 1.8, dash: str = "", opacity: float = 1.0) -> None:
+        """Add a line, interrupted where it is not finite."""
+        style = f"fill:none;stroke:{colour};stroke-width:{width:g};stroke-linejoin:round"
+        style += (f";stroke-dasharray:{dash}" if dash else "") + (f";stroke-opacity:{opacity:g}" if opacity < 1 else "")
+        self._add("line", x, y, style)
+
+    def band(self, x: Values, low: Values, high: Values, colour: str, opacity: float = 0.16) -> None:
+        """Add the area between two lines, without places where one is not finite."""
+        known = np.isfinite(low) & np.isfinite(high)
+        runs = np.split(np.arange(len(known)), np.flatnonzero(np.diff(known)) + 1)
+        for at in (run for run in runs if len(run) and known[run[0]]):
+            xs, ys = np.asarray(x)[at], np.concatenate([np.asarray(low)[at], np.asarray(high)[at][::-1]])
+            self._add("line", np.concatenate([xs, xs[::-1]]), ys, f"fill:{colour};fill-opacity:{opacity:g};stroke:none")
+
+    def points(self, x: Values, y: Values, colour: str, marker: str = "o", size: float = 6.0, ring: float = 0.0) -> None:
+        """Add markers; ``ring`` is the width of a hollow one's line."""
+        style = f"fill:none;stroke:{colour};stroke-width:{ring:g}" if ring else f"fill:{colour}"
+        self._add("points", x, y, (marker, size, style))
+
+    def across(self, y: float, colour: str, width: float = 1.0, dash: str = "", opacity: float = 1.0) -> None:
+        """Add a level line over the whole width."""
+        self.line([math.nan], [y], colour, width, dash, opacity)
+
+    def upright(self, x: float, colour: str, width: float = 1.0) -> None:
+        """Add a vertical line over the whole height."""
+        self.line([x], [math.nan], colour, width)
+
+    def name(self, x: float, y: float, text: str, colour: str) -> None:
+        """Write a name beside a point, once the limits are known: right and above, or at the nearest height where it covers no other."""
+        (px, py), width = (float(v[0]) for v in self._at([x], [y])), LETTER_PT * len(text)
+        dx = 7.0 if px + 7.0 + width <= self.box[2] else -7.0 - width
+        heights = sorted((5.0 + LINE_PT * k for k in range(-12, 13)), key=lambda dy: abs(dy - 5.0))
+        boxes = [(px + dx, px + dx + width, py - dy - LINE_PT, py - dy) for dy in heights]
+        inside = [b for b in boxes if b[2] >= self.box[1] and b[3] <= self.box[3]]
+        free = [b for b in inside if not any(b[0] < t[1] and t[0] < b[1] and b[2] < t[3] and t[2] < b[3] for t in self.named)]
+        self.named.append(free[0] if free else boxes[0])
+        self._drawn.append(("text", (*self.named[-1], text, colour)))
+
+    def range(self, axis: Literal[0, 1]) -> tuple[float, float]:
+        """Return the limits of an axis."""
+        if self.limits[axis] is not None:
+            return self.limits[axis]  # type: ignore[return-value]
+        seen = self._seen[axis] or [0.0]
+        low, high = min(seen), max(seen)
+        if high == low:
+            return low - 0.05 * (abs(low) or 1.0), high + 0.05 * (abs(high) or 1.0)
+        return low - self.room[axis] * (high - low), high + self.room[axis] * (high - low)
+
+    def svg(self) -> str:
+        """Draw everything."""
+        (width, height), (left, top, right, bottom) = self.size, self.box
+        x_ticks, y_ticks = (self._ticks(axis) for axis in (0, 1))
+        at_x, at_y = self._at([v for v, _ in x_ticks], [])[0], self._at([], [v for v, _ in y_ticks])[1]
+        text = f"fill:{MUTED};font-size:{FONT_PT:g}px"
+        lines = [f"M{x:.2f} {top:g}V{bottom:g}" for x in at_x if "x" in self._grid]
+        lines += [f"M{left:g} {y:.2f}H{right:g}" for y in at_y if "y" in self._grid]
+        lines += [f"M{left:g} {bottom:g}H{right:g}"] + ([f"M{left:g} {top:g}V{bottom:g}"] if self.spine else [])
+        out = [f'<path d="{"".join(lines)}" style="fill:none;stroke:{GRID};stroke-width:0.8"/>']
+        for x, (_, label) in zip(at_x, x_ticks, strict=True):
+            turn = f' transform="rotate(-30 {x:.2f} {bottom + 12:g})"' if self.tilted else ""
+            out.append(_text(float(x), bottom + 12, label, text, "end" if self.tilted else "middle", turn))
+        out += [_text(left - 3.5, float(y) + 3.5, label, text, "end") for y, (_, label) in zip(at_y, y_ticks, strict=True)]
+        out.append(_text(right, height - 6.0, self.labels[0], text, "end"))
+        turn = f' transform="rotate(-90 10 {(top + bottom) / 2:g})"'
+        out.append(_text(10.0, (top + bottom) / 2, self.labels[1], text, "middle", turn))
+        inner = f'x="{left:g}" y="{top:g}" width="{right - left:g}" height="{bottom - top:g}"'  # lines end at the axes
+        box = f'viewBox="{left:g} {top:g} {right - left:g} {bottom - top:g}" preserveAspectRatio="none"'
+        out += [f"<svg {inner} {box}>", *(self._path(*what) for kind, what in self._drawn if kind == "line"), "</svg>"]
+        out += [self._markers(*what) for kind, what in self._drawn if kind == "points"]
+        for begin, _, _, base, name, colour in (what for kind, what in self._drawn if kind == "text"):
+            out.append(_text(begin, base - 2.5, name, f"fill:{colour};font-size:{FONT_PT:g}px", "start"))
+        return f'<svg viewBox="0 0 {width:g} {height:g}" role="img" class="chart">{"".join(out)}</svg>'
+
+    def _add(self, kind: str, x: Values, y: Values, what: Any) -> None:
+        for seen, values in zip(self._seen, (x, y), strict=True):
+            seen += [float(v) for v in values if math.isfinite(v)]
+        self._drawn.append((kind, (np.asarray(x, np.float64), np.asarray(y, np.float64), what)))
+
+    def _at(self, x: Values, y: Values) -> tuple[F64, F64]:
+        """Return where data are in the picture, points from its upper left corner."""
+        left, top, right, bottom = self.box
+        (x0, x1), (y0, y1), xs = self.range(0), self.range(1), np.asarray(x, np.float64)
+        if self.log:
+            x0, x1, xs = math.log(x0), math.log(x1), np.log(xs)
+        return left + (right - left) * (xs - x0) / (x1 - x0), bottom - (bottom - top) * (np.asarray(y, np.float64) - y0) / (y1 - y0)
+
+    def _path(self, xs: F64, ys: F64, style: str) -> str:
+        left, top, right, bottom = self.box
+        x, y = (np.clip(v, -1e4, 1e4) for v in self._at(xs, ys))  # NaN stays
+        if len(x) == 1 and math.isnan(y[0]):
+            x, y = x[[0, 0]], np.array([top, bottom])
+        elif len(x) == 1 and math.isnan(x[0]):
+            x, y = np.array([left, right]), y[[0, 0]]
+        known = np.isfinite(x) & np.isfinite(y)
+        after = np.concatenate([[False], known[:-1]])  # a point begins a new line where none is known before it
+        steps = (f"{'L' if on else 'M'}{a:.2f} {b:.2f}" for a, b, ok, on in zip(x, y, known, after, strict=True) if ok)
+        return f'<path d="{"".join(steps)}" style="{style}"/>'
+
+    def _markers(self, xs: F64, ys: F64, how: tuple[str, float, str]) -> str:
+        """Draw the markers whose middles are inside the axes."""
+        left, top, right, bottom = self.box
+        x, y = self._at(xs, ys)
+        inside = (x > left - 0.5) & (x < right + 0.5) & (y > top - 0.5) & (y < bottom + 0.5)
+        return "".join(_marker(float(a), float(b), *how) for a, b in zip(x[inside], y[inside], strict=True))
+
+    def _ticks(self, axis: Literal[0, 1]) -> Sequence[Tick]:
+        given = self.ticks[axis]
+        low, high = sorted(self.range(axis))
+        if given is not None:
+            return [tick for tick in given if low <= tick[0] <= high]
+        length = self.box[2] - self.box[0] if axis == 0 else self.box[3] - self.box[1]
+        most = min(max(math.floor(length / FONT_PT / (3 if axis == 0 else 2)), 1), 9)
+        power = 10.0 ** math.floor(math.log10((high - low) / most))
+        step = next(one * power for one in STEPS if one * power * most >= 0.999999 * (high - low))
+        decimals = next(d for d in range(16) if abs(step * 10**d - round(step * 10**d)) < 1e-6 * step * 10**d)
+        first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+        return [(k * step, f"{k * step:.{decimals}f}".replace("-", "\u2212")) for k in range(first, last + 1)]
+
+
+def _text(x: float, y: float, text: str, style: str, anchor: str, more: str = "") -> str:
+    return f'<text x="{x:.2f}" y="{y:.2f}" style="{style};text-anchor:{anchor}"{more}>{escape(text)}</text>' if text else ""
+
+
+def _marker(x: float, y: float, marker: str, size: float, style: str) -> str:
+    if marker == "o":
+        return f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{size / 2:g}" style="{style}"/>'
+    return f'<polygon points="{SHAPES[marker]}" transform="translate({x:.2f} {y:.2f}) scale({size:g})" style="{style}"/>'
 
 
 def line_chart(curves: Sequence[Curve], x_label: str, y_label: str, y_top: float | None = None) -> str:
     """Draw curves with bands and return themed SVG."""
-    with mpl.rc_context(RC):
-        figure, axes = new_axes()
-        for curve in curves:
-            colour = VARIANT[curve.colour % N_COLOURS]
-            if curve.low is not None and curve.high is not None:
-                axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.16, linewidth=0)
-            axes.plot(curve.x, curve.y, color=colour, linestyle=DASHES[curve.dash % len(DASHES)], label=curve.label)
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
-        axes.set_ylim(bottom=0.0, top=max(axes.get_ylim()[1], LEAST_SPAN["m"]) if y_top is None else y_top)
-        axes.margins(x=0.01)
-        axes.tick_params(length=0)
-        return themed_svg(figure)
+    axes = Axes()
+    for curve in curves:
+        colour = VARIANT[curve.colour % N_COLOURS]
+        if curve.low is not None and curve.high is not None:
+            axes.band(curve.x, curve.low, curve.high, colour)
+        axes.line(curve.x, curve.y, colour, dash=DASHES[curve.dash % len(DASHES)])
+    axes.labels = [x_label, y_label]
+    axes.limits[1] = 0.0, max(axes.range(1)[1], LEAST_SPAN["m"]) if y_top is None else y_top
+    axes.room[0] = 0.01
+    return axes.svg()
 
 
-def themed_svg(figure: Figure) -> str:
-    """Print a figure as an SVG element whose colours are CSS variables and whose ids cannot meet those of another figure."""
-    buffer = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :]
-    for colour, variable in VARIABLES.items():
-        svg = svg.replace(colour, variable)
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    # Hundredths of a point are plenty; numbers between tags are text and stay.
-    svg = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), svg)
-    svg = re.sub(r'font: ([\d.]+)px [^;"]*', r"font-size: \1px", svg)
-    prefix = f"c{zlib.crc32(svg.encode()):08x}"
-    svg = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', svg)
-    svg = re.sub(r'(url\(#|href="#)', rf"\1{prefix}-", svg)
-    return re.sub(r'<svg [^>]*?(viewBox="[^"]+")[^>]*>', r'<svg \1 role="img" class="chart">', svg, count=1)
-
-
-def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[tuple[str, str], tuple[int, int]]) -> list[Chart]:
-    """Draw how far from the logged path the ego is over time, and how many rollouts are still without an event."""
-    charts = []
-    by_variant: dict[tuple[str, str], list[Rollout]] = {}
-    for rollout in rollouts:
-        if rollout.ok and "lateral_bias_m" in series.get(rollout.cell, {}):
-            by_variant.setdefault((rollout.renderer, rollout.policy), []).append(rollout)
-    by_variant = {variant: by_variant[variant] for variant in variant_of if variant in by_variant}
-    if not by_variant:
-        return []
-    several = len({policy for _, policy in by_variant}) > 1
-
-    def curves(make: Callable[[list[Rollout]], tuple[F64, ...]]) -> list[Curve]:
-        names = {key: " \u00b7 ".join(key) if several else key[0] for key in by_variant}
-        return [Curve(names[key], *variant_of[key], *make(members)) for key, members in by_variant.items()]
-
-    charts.append(
-        Chart(
-            "Distance from the logged path over time",
-            "Line: median over rollouts. Band: 10th to 90th percentile. Drawn while at least half of the rollouts still run.",
-            line_chart(curves(lambda members: _offset_band(members, series)), "s since start", "m beside the path"),
-        )
-    )
-    charts.append(
-        Chart(
-            "Rollouts without a collision or off-road event so far",
-            "Share of completed rollouts, by time of the first counted event.",
-            line_chart(curves(lambda members: _survival(members, series)), "s since start", "% of rollouts", y_top=104.0),
-        )
-    )
-    return charts
-
-
-def _offset_band(members: list[Rollout], series: Series) -> tuple[F64, ...]:
-    own = [series[r.cell]["lateral_bias_m"] for r in members]
-    end_s = max(float(t[-1] - t[0]) for t, _ in own) * 1e-6
-    grid = np.linspace(0.0, end_s, N_BINS)
-    values = np.full((len(own), N_BINS), np.nan)  # (rollouts, times); NaN after a rollout's end
-    for row, (t_us, offset) in zip(values, own, strict=True):
-        seconds = (t_us - t_us[0]) * 1e-6
-        inside = grid <= seconds[-1] + 1e-9
-        row[inside] = np.abs(np.interp(grid[inside], seconds, offset))
-    enough = np.count_nonzero(np.isfinite(values), axis=0) * 2 >= len(own)  # later, the few long scenes would pass for a trend
-    low, middle, high = np.nanpercentile(values[:, enough], [10, 50, 90], axis=0)
-    return grid[enough], middle, low, high
-
-
-def _survival(members: list[Rollout], series: Series) -> tuple[F64, ...]:
-    ends = [series[r.cell]["lateral_bias_m"][0] for r in members]
-    end_s = max(float(t[-1] - t[0]) for t in ends) * 1e-6
-    firsts = [min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=np.inf) for r in members]
-    times = np.array(sorted(t for t in firsts if np.isfinite(t)))
-    x = np.concatenate([[0.0], np.repeat(times, 2), [end_s]])
-    alive = 100.0 * (1.0 - np.arange(len(times) + 1) / len(members))
-    y = np.repeat(alive, 2)
-    return x, y
-
-
-LETTER_PT, LINE_PT = 6.0, 12.0  # width and height of a letter of a name, points
-CHARACTER_IN = 0.075  # width of a tick label's character, inches: the page's font at 10 points
-MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
 ERRORS = ("collision_at_fault", "offroad", "lateral_distance_m")
 
 
@@ -246,30 +290,26 @@ def _forest_chart(unit: str, baseline: str, several: bool, lines: Sequence[_Line
     names = list(dict.fromkeys(line.metric.words for line in lines))
     variants = sorted({line.variant for line in lines})
     gap = 1.0 / (len(variants) + 1)
-    with mpl.rc_context(RC | {"axes.grid.axis": "x"}):
-        left_in = 0.15 + CHARACTER_IN * max(len(name) for name in names)
-        figure, axes = new_axes(0.75 + 0.42 * len(metrics) * max(1.0, 0.6 * len(variants)), min(left_in, 0.55 * SIZE_IN[0]))
-        axes.axvline(0.0, color=INK, linewidth=1.0)
-        for line in lines:
-            y = metrics.index(line.metric.name) + (variants.index(line.variant) + 1) * gap - 0.5
-            colour = VARIANT[line.variant % N_COLOURS]
-            axes.plot([line.low, line.high], [y, y], color=colour, linewidth=1.8, solid_capstyle="butt")
-            axes.plot([line.centre], [y], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=5.5)
-        for row, metric in enumerate(metrics):
-            margin = max(line.margin for line in lines if line.metric.name == metric)
-            if margin > 0.0:
-                axes.plot([margin, margin], [row - 0.42, row + 0.42], color=MUTED, linewidth=1.0, linestyle=(0, (2.0, 2.0)))
-        _no_magnifying(axes.get_xlim, axes.set_xlim, unit)
-        axes.set_yticks(range(len(metrics)), names)
-        axes.set_ylim(len(metrics) - 0.5, -0.5)
-        axes.tick_params(length=0)
-        axes.spines["left"].set_visible(False)
-        worse_in = "percentage points" if unit == "points" else unit or "no unit"
-        axes.set_xlabel(f"{worse_in} worse than {baseline} \u2192", x=1.0, ha="right")
-        svg = themed_svg(figure)
+    left_pt = min(11.0 + 0.9 * LETTER_PT * max(len(name) for name in names), 0.55 * SIZE_PT[0])
+    axes = Axes(54.0 + 30.0 * len(metrics) * max(1.0, 0.6 * len(variants)), left_pt, grid="x")
+    axes.upright(0.0, INK)
+    for line in lines:
+        y = metrics.index(line.metric.name) + (variants.index(line.variant) + 1) * gap - 0.5
+        colour = VARIANT[line.variant % N_COLOURS]
+        axes.line([line.low, line.high], [y, y], colour)
+        axes.points([line.centre], [y], colour, MARKERS[line.variant % len(MARKERS)], 5.5)
+    for row, metric in enumerate(metrics):
+        margin = max(line.margin for line in lines if line.metric.name == metric)
+        if margin > 0.0:
+            axes.line([margin, margin], [row - 0.42, row + 0.42], MUTED, 1.0, "2 2")
+    _no_magnifying(axes, 0, unit)
+    axes.ticks[1], axes.limits[1] = list(enumerate(names)), (len(metrics) - 0.5, -0.5)
+    axes.spine = False
+    worse_in = "percentage points" if unit == "points" else unit or "no unit"
+    axes.labels[0] = f"{worse_in} worse than {baseline} \u2192"
     title = "Rates and shares" if unit == "points" else "Distances" if unit == "m" else f"In {unit or 'numbers without unit'}"
     title += f", against {baseline}" if several else ""
-    return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
+    return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", axes.svg())
 
 
 @dataclass(frozen=True)
@@ -309,53 +349,26 @@ def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
 
 
 def _speed_chart(metric: MetricInfo, unit: str, points: Sequence[_Point]) -> Chart:
-    with mpl.rc_context(RC):
-        figure, axes = new_axes()
-        axes.axhline(0.0, color=INK, linewidth=0.9, alpha=0.7)
-        for point in points:
-            line, colour = point.line, VARIANT[point.line.variant % N_COLOURS]
-            axes.plot([point.mean_ms, point.mean_ms], [line.low, line.high], color=colour, linewidth=1.8)
-            axes.plot([point.mean_ms, max(point.p95_ms, point.mean_ms)], [line.centre, line.centre], color=colour, linewidth=0.9, alpha=0.7)
-            axes.plot([point.mean_ms], [line.centre], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=7, label=point.variant)
-        _no_magnifying(axes.get_ylim, axes.set_ylim, unit)
-        _time_axis(axes, [ms for p in points for ms in (p.mean_ms, p.p95_ms)])
-        _name(axes, points)
-        axes.set_xlabel("ms per camera frame: mean, line to the 95th percentile")
-        axes.set_ylabel("points worse" if unit == "points" else f"{unit} worse")
-        axes.tick_params(length=0)
-        return Chart(metric.words, "Paired with the baseline, which lies on the line; 95 % over scenes.", themed_svg(figure))
-
-
-def _name(axes: Axes, points: Sequence[_Point]) -> None:
-    """Write each renderer's name beside its point: right and above, or at the nearest height where it covers no other name."""
-    point_px = axes.figure.dpi / 72
-    taken: list[tuple[float, float, float, float]] = []  # left, right, bottom, top in points from the figure's corner
+    axes = Axes()
+    axes.across(0.0, INK, 0.9, opacity=0.7)
+    for point in points:
+        line, colour = point.line, VARIANT[point.line.variant % N_COLOURS]
+        axes.line([point.mean_ms, point.mean_ms], [line.low, line.high], colour)
+        axes.line([point.mean_ms, max(point.p95_ms, point.mean_ms)], [line.centre, line.centre], colour, 0.9, opacity=0.7)
+        axes.points([point.mean_ms], [line.centre], colour, MARKERS[line.variant % len(MARKERS)], 7.0)
+    _no_magnifying(axes, 1, unit)
+    _time_axis(axes, [ms for p in points for ms in (p.mean_ms, p.p95_ms)])
     for point in sorted(points, key=lambda p: p.mean_ms):
-        x, y = axes.transData.transform((point.mean_ms, point.line.centre)) / point_px
-        width, right_end = LETTER_PT * len(point.variant), axes.bbox.x1 / point_px
-        dx = 7.0 if x + 7.0 + width <= right_end else -7.0 - width
-        steps = sorted((5.0 + LINE_PT * k for k in range(-12, 13)), key=lambda dy: abs(dy - 5.0))
-        boxes = ((x + dx, x + dx + width, y + dy, y + dy + LINE_PT) for dy in steps)
-        bottom, top = axes.bbox.y0 / point_px, axes.bbox.y1 / point_px
-        box = None
-        for b in boxes:
-            covers = any(b[0] < t[1] and t[0] < b[1] and b[2] < t[3] and t[2] < b[3] for t in taken)
-            if b[2] >= bottom and b[3] <= top and not covers:
-                box = b
-                break
-        box = box or (x + dx, x + dx + width, y + 5.0, y + 5.0 + LINE_PT)
-        taken.append(box)
-        colour = VARIANT[point.line.variant % N_COLOURS]
-        place = (point.mean_ms, point.line.centre)
-        axes.annotate(point.variant, place, (box[0] - x, box[2] - y), textcoords="offset points", color=colour)
+        axes.name(point.mean_ms, point.line.centre, point.variant, VARIANT[point.line.variant % N_COLOURS])
+    axes.labels = ["ms per camera frame: mean, line to the 95th percentile", "points worse" if unit == "points" else f"{unit} worse"]
+    return Chart(metric.words, "Paired with the baseline, which lies on the line; 95 % over scenes.", axes.svg())
 
 
-def _no_magnifying(get: Callable[[], tuple[float, float]], put: Callable[[float, float], Any], unit: str) -> None:
+def _no_magnifying(axes: Axes, axis: Literal[0, 1], unit: str) -> None:
     """Widen an axis around zero to `LEAST_SPAN`: a micrometre drawn across the page would pass for a finding."""
-    low, high = get()
-    lacking = LEAST_SPAN.get(unit, 0.0) - (high - low)
-    if lacking > 0.0:
-        put(low - lacking / 2, high + lacking / 2)
+    low, high = axes.range(axis)
+    lacking = max(LEAST_SPAN.get(unit, 0.0) - (high - low), 0.0)
+    axes.limits[axis] = low - lacking / 2, high + lacking / 2
 
 
 def _time_axis(axes: Axes, ms: Sequence[float]) -> None:
@@ -363,11 +376,7 @@ def _time_axis(axes: Axes, ms: Sequence[float]) -> None:
     low, high = min(ms), max(ms)
     if high < 4.0 * low:
         room = max(high - low, 0.1 * high)
-        axes.set_xlim(max(low - 0.6 * room, 0.0), high + 0.6 * room)
+        axes.limits[0] = max(low - 0.6 * room, 0.0), high + 0.6 * room
         return
-    axes.set_xscale("log")
-    low, high = low / 2.0, high * 2.0
-    axes.set_xlim(low, high)
-    axes.set_xticks([t for t in (base * 10**k for k in range(-1, 6) for base in (1, 2, 5)) if low <= t <= high])
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.log, axes.limits[0] = True, (low / 2.0, high * 2.0)
+    axes.ticks[0] = [(t, f"{t:g}") for t in (base * 10.0**k for k in range(-1, 6) for base in (1, 2, 5))]

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import marshal
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
+from importlib.util import MAGIC_NUMBER
 from pathlib import Path
 from typing import Any
 
 import cv2
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import BytecodeCache, ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from jinja2 import __version__ as jinja_version
+from jinja2.bccache import Bucket
 from markupsafe import Markup
 
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io.atomic import write_bytes, write_text
 from alpasim_plugin.io.limits import SOURCE_BYTES
 from alpasim_plugin.io.reading import parsing, read_bytes
 from alpasim_plugin.io.reading.images import decode_image
@@ -27,13 +33,13 @@ from evaluators.metrics.outcomes import OUTCOMES, has_ended, in_words, outcomes_
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
-from evaluators.report.charts import drift_charts, forest, speed_against_error
+from evaluators.report.charts import forest, speed_against_error
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, fixed, plural
 from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
-from evaluators.report.rollouts import read_series, rollout_block
+from evaluators.report.rollouts import drift_charts, read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 from evaluators.report.verdict import decision_section, gate_section
@@ -79,16 +85,50 @@ def render_report(run: Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> str:
     return render_page("report.html.j2", ("theme", "report"), ("theme", "report", "rollouts"), dash=DASH, replays=replays, **context(run))
 
 
+class CompiledBeside(BytecodeCache):
+    """Keeps compiled templates in a ``__pycache__``, as Python does with modules, and where Python does.
+
+    A file that is not whole, or of other versions, is made again; where none can be written, every process compiles.
+    """
+
+    folder = Path(__file__).with_name("__pycache__")
+    head = MAGIC_NUMBER + f"{jinja_version}\n".encode()
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Take the code of a template of this source."""
+        with suppress(OSError):
+            found = (self.folder / f"{bucket.key}.template").read_bytes()
+            code = found[len(self.head) + 32 :]
+            if found == self._whole(bucket, code):
+                bucket.code = marshal.loads(code)
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep the code of a template."""
+        if not sys.dont_write_bytecode:
+            with suppress(OSError, InfrastructureError):
+                write_bytes(self.folder / f"{bucket.key}.template", self._whole(bucket, marshal.dumps(bucket.code)))
+
+    def _whole(self, bucket: Bucket, code: bytes) -> bytes:
+        return self.head + hashlib.sha256(bucket.checksum.encode() + code).digest() + code
+
+
 @cache
-def _environment() -> Environment:
-    """Return the templates; a process compiles each of them once."""
-    loader = PackageLoader("evaluators.report")
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+def environment_of(*packages: str) -> Environment:
+    """Return the templates of packages, the first that has a name; a process reads each template once."""
+    loader = ChoiceLoader([PackageLoader(package) for package in packages])
+    return Environment(
+        loader=loader,
+        bytecode_cache=CompiledBeside(),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def render_page(template: str, styles: Sequence[str], scripts: Sequence[str], **values: Any) -> str:
     """Render a template with style sheets and scripts inside the page; the hash allows the page to run this script and no other."""
-    environment = _environment()
+    environment = environment_of("evaluators.report")
     style = "\n".join(asset(environment, f"{name}.css") for name in styles)
     script = "\n".join(asset(environment, f"{name}.js") for name in scripts)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import matplotlib as mpl
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.metrics import METRICS
 from evaluators.opening import Run
-from evaluators.report.charts import GRID, MARKERS, N_COLOURS, RC, VARIANT, Chart, new_axes, themed_svg
+from evaluators.report.charts import GRID, MARKERS, N_COLOURS, VARIANT, Axes, Chart
 from evaluators.report.numbers import Cell, fixed, missing, plural, short
 from evaluators.report.rollouts import COLLISION
 from evaluators.statistics.intervals import clustered
@@ -227,27 +226,22 @@ def strata_chart(one: Strata) -> Chart | None:
     if len(known) < 2:
         return None
     variants = sorted({b.variant for s in known for b in s.bins})
-    with mpl.rc_context(RC | {"axes.grid.axis": "y"}):
-        figure, axes = new_axes()
-        for k, stratum in enumerate(known):
-            for b in stratum.bins:
-                if name not in b.means:
-                    continue
-                x = k + (variants.index(b.variant) + 1) / (len(variants) + 1) - 0.5
-                mean, low, high = b.means[name]
-                colour = VARIANT[b.variant % N_COLOURS]
-                if low is not None and high is not None:
-                    axes.plot([x, x], [max(low, 0.0), high], color=colour, linewidth=1.8)
-                axes.plot([x], [mean], MARKERS[b.variant % len(MARKERS)], color=colour, markersize=6)
-        for k in range(1, len(known)):
-            axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
-        ticks = [s.label.replace(f"\u00a0{one.unit}", "") if one.unit else s.label for s in known]
-        ticks = [tick.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013") for tick in ticks]
-        axes.set_xticks(range(len(known)), ticks, fontsize=8.5)
-        axes.set_xlim(-0.5, len(known) - 0.5)
-        axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])  # the highest marker is whole
-        axes.set_ylabel("m between plans in a row")
-        axes.set_xlabel(f"{one.axis}, {one.unit}" if one.unit else one.axis)
-        axes.tick_params(length=0)
-        svg = themed_svg(figure)
-    return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", svg)
+    axes = Axes(grid="y")
+    for k, stratum in enumerate(known):
+        for b in stratum.bins:
+            if name not in b.means:
+                continue
+            x = k + (variants.index(b.variant) + 1) / (len(variants) + 1) - 0.5
+            mean, low, high = b.means[name]
+            colour = VARIANT[b.variant % N_COLOURS]
+            if low is not None and high is not None:
+                axes.line([x, x], [max(low, 0.0), high], colour)
+            axes.points([x], [mean], colour, MARKERS[b.variant % len(MARKERS)])
+    for k in range(1, len(known)):
+        axes.upright(k - 0.5, GRID, 0.8)
+    ticks = [s.label.replace(f"\u00a0{one.unit}", "") if one.unit else s.label for s in known]
+    ticks = [tick.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013") for tick in ticks]
+    axes.ticks[0], axes.limits[0] = list(enumerate(ticks)), (-0.5, len(known) - 0.5)
+    axes.limits[1] = 0.0, 1.08 * axes.range(1)[1]  # the highest marker is whole
+    axes.labels = [f"{one.axis}, {one.unit}" if one.unit else one.axis, "m between plans in a row"]
+    return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", axes.svg())

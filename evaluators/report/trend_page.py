@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-import matplotlib as mpl
 import numpy as np
 
 from alpasim_plugin.io.atomic import write_text
-from evaluators.report.charts import MARKERS, MUTED, N_COLOURS, RC, VARIANT, Chart, new_axes, themed_svg
+from evaluators.report.charts import MARKERS, N_COLOURS, VARIANT, Axes, Chart
 from evaluators.report.html import render_page
 from evaluators.report.numbers import finite, interval
 from evaluators.report.runs import RunEntry, shown_folder
@@ -113,7 +112,7 @@ def _moved(found: Trend, colours: dict[str, int]) -> list[MovedRow]:
     return [row for *_, row in sorted(rows, key=lambda one: one[:2])]
 
 
-WIDTH_IN, HEIGHT_IN = 9.6, 3.0
+WIDTH_PT, HEIGHT_PT = 691.2, 216.0
 MOST_TICKS = 14
 ASIDE = 0.16  # between the renderers of one run, in runs
 NAME_LETTERS = 12
@@ -134,36 +133,29 @@ def trend_chart(series: Series, metric: str, colours: Mapping[str, int]) -> Char
     unit = next((str(one["unit"]) for one in facts if one.get("unit")), "")
     scale = 100.0 if series.runs[-1].table.shown(metric).in_percent else 1.0
     is_dense = len(series.runs) > DENSE
-    with mpl.rc_context(RC):
-        figure, axes = new_axes(HEIGHT_IN, 0.85, 0.7, WIDTH_IN)
-        for number, line in enumerate(lines):
-            colour = VARIANT[colours[line.renderer] % N_COLOURS]
-            x = np.array([place[id(run)] for run in line.runs]) + ASIDE * (number - (len(lines) - 1) / 2)
-            means, bars = _values(series, line, scale)
-            low, high = np.array([(np.nan, np.nan) if one is None else one for one in bars]).T
-            if is_dense:
-                axes.plot(x, means, color=colour, linewidth=1.2)
-                axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
-            else:
-                marker = MARKERS[colours[line.renderer] % len(MARKERS)]
-                axes.plot(x, means, color=colour, linewidth=1.5, marker=marker, markersize=4.5)
-                axes.vlines(x, low, high, color=colour, linewidth=1.2, alpha=0.55)
-            moved = [k + 1 for k, step in enumerate(line.steps) if step.moved]
-            axes.plot(
-                x[moved], np.asarray(means)[moved], "o", markersize=13, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.6
-            )
-        every = max(1, -(-len(series.runs) // MOST_TICKS))
-        ticks = range(0, len(series.runs), every)
-        axes.set_xticks(list(ticks), [label_of(series.runs[k]) for k in ticks], rotation=30, ha="right", fontsize=9)
-        axes.set_xlim(-0.5, len(series.runs) - 0.5)
-        axes.set_ylabel("%" if scale == 100.0 else unit, color=MUTED)
-        axes.tick_params(length=0)
-        axes.margins(y=0.12)
-        svg = themed_svg(figure)
+    axes = Axes(HEIGHT_PT, 61.0, 50.0, WIDTH_PT)
+    for number, line in enumerate(lines):
+        colour = VARIANT[colours[line.renderer] % N_COLOURS]
+        x = np.array([place[id(run)] for run in line.runs]) + ASIDE * (number - (len(lines) - 1) / 2)
+        means, bars = _values(series, line, scale)
+        low, high = np.array([(np.nan, np.nan) if one is None else one for one in bars]).T
+        axes.line(x, means, colour, 1.2 if is_dense else 1.5)
+        if is_dense:
+            axes.band(x, low, high, colour)
+        else:
+            axes.points(x, means, colour, MARKERS[colours[line.renderer] % len(MARKERS)], 4.5)
+            for at, *bar in zip(x, low, high, strict=True):
+                axes.line([at, at], bar, colour, 1.2, opacity=0.55)
+        moved = [k + 1 for k, step in enumerate(line.steps) if step.moved]
+        axes.points(x[moved], np.asarray(means)[moved], colour, size=13.0, ring=1.6)
+    every = max(1, -(-len(series.runs) // MOST_TICKS))
+    axes.ticks[0] = [(float(k), label_of(series.runs[k])) for k in range(0, len(series.runs), every)]
+    axes.limits[0], axes.tilted, axes.room[1] = (-0.5, len(series.runs) - 0.5), True, 0.12
+    axes.labels[1] = "%" if scale == 100.0 else unit
     direction = next((str(one["direction"]) for one in facts if one.get("direction")), "none")
     better = {"lower": "Lower is better. ", "higher": "Higher is better. "}.get(direction, "")
     note = f"{better}{'Bands' if is_dense else 'Bars'}: 95 % over scenes. A ring: moved against the run before it, on the same cells."
-    return Chart(metric, note, svg)
+    return Chart(metric, note, axes.svg())
 
 
 def label_of(run: RunEntry) -> str:

@@ -257,9 +257,7 @@ def decision_section(run: Run) -> DecisionSection | None:
 
 def chart(decision: Decision, metric: MetricInfo) -> Any:
     """Draw the confidence sequence of a metric over scenes, with the margin."""
-    import matplotlib as mpl
-
-    from evaluators.report.charts import INK, MUTED, RC, VARIANT, Chart, new_axes, themed_svg
+    from evaluators.report.charts import INK, MUTED, VARIANT, Axes, Chart
 
     name, one = metric.name, decision["question"]["metrics"][metric.name]
     looks = decision["looks"]
@@ -270,24 +268,20 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     sign = -1.0 if metric.direction == "higher" else 1.0
     threshold = scale * sign * one["threshold"]
     limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
-    with mpl.rc_context(RC):
-        figure, axes = new_axes()
-        axes.fill_between(n, low, high, color=VARIANT[1], alpha=0.2, linewidth=0, step="post" if len(n) == 1 else None)
-        axes.plot(n, diff, color=VARIANT[1], marker="o", markersize=3)
-        axes.axhline(0.0, color=MUTED, linewidth=0.8)
-        for limit in limits:
-            axes.axhline(limit, color=INK, linewidth=1.0, linestyle=(0, (5.0, 2.0)))
-        late = len(looks) // 2  # the bounds of the first looks would make the rest flat
-        known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
-        known = known[np.isfinite(known)]
-        room = 0.15 * max(float(np.ptp(known)), 1e-9)
-        axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
-        axes.set_xlim(0.0, float(n[-1]) * 1.02)
-        axes.set_xlabel("scenes")
-        axes.set_ylabel((f"{unit.strip()}, " if unit.strip() else "") + f"{decision['candidate']} minus {decision['baseline']}")
-        axes.tick_params(length=0)
-        svg = themed_svg(figure)
-    return Chart(name, "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.", svg)
+    axes = Axes()
+    axes.band(n, low, high, VARIANT[1], 0.2)
+    axes.line(n, diff, VARIANT[1])
+    axes.points(n, diff, VARIANT[1], size=3.0)
+    axes.across(0.0, MUTED, 0.8)
+    for limit in limits:
+        axes.across(limit, INK, 1.0, "5 2")
+    late = len(looks) // 2  # the bounds of the first looks would make the rest flat
+    known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
+    known = known[np.isfinite(known)]
+    room = 0.15 * max(float(np.ptp(known)), 1e-9)
+    axes.limits = [(0.0, float(n[-1]) * 1.02), (float(known.min()) - room, float(known.max()) + room)]
+    axes.labels = ["scenes", (f"{unit.strip()}, " if unit.strip() else "") + f"{decision['candidate']} minus {decision['baseline']}"]
+    return Chart(name, "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.", axes.svg())
 
 
 def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float, str, int]:

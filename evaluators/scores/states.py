@@ -6,6 +6,7 @@ ones gives them instead.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -144,13 +145,58 @@ def in_axes(vectors: F64, yaw: F64) -> F64:
 
 def smooth(values: F64, window: int = 8, order: int = 2) -> F64:
     """Return values ``(T,)`` through a Savitzky-Golay filter, whose window is never longer than they are."""
-    return np.asarray(scipy.signal.savgol_filter(values, min(window, _enough(values, order)), order))
+    return savitzky_golay(values, min(window, _enough(values, order)), order)
 
 
 def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
     """Return a derivative in time of values ``(T,)`` by a Savitzky-Golay filter at the mean step, per second to the power of ``times``."""
     step_s = float(np.mean(np.diff(t_us))) * 1e-6
-    return np.asarray(scipy.signal.savgol_filter(values, min(window, _enough(values, order)), order, deriv=times, delta=step_s))
+    return savitzky_golay(values, min(window, _enough(values, order)), order, times, step_s)
+
+
+def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: float = 1.0) -> F64:
+    """Return values ``(T,)``, or a derivative of them, by polynomials fitted to a moving window (Savitzky and Golay 1964).
+
+    The half window at either end is read off the polynomial of the outermost window. It is `scipy.signal.savgol_filter` to the last bit;
+    its module takes longer to load than a drive takes to score.
+
+    Args:
+        values: ``(T,)``, T not below ``window``.
+        window: Values that a polynomial is fitted to; an even window looks half a step ahead.
+        order: Of the polynomial, below ``window``.
+        times: How often it is differentiated, at most ``order``.
+        step: Between two values.
+    """
+    half, n = window // 2, len(values)
+    # The weights of a window's values: those of the polynomial's coefficient, from its oldest value to its newest.
+    offset = np.arange(half - 0.5 if window % 2 == 0 else half, -half - 0.5 if window % 2 == 0 else -half - 1, -1.0)
+    wanted = np.zeros(order + 1)
+    wanted[times] = math.factorial(times) / step**times
+    eps = np.finfo(np.float64).eps
+    design = offset ** np.arange(order + 1.0)[:, None]
+    weights = scipy.linalg.lstsq(design, wanted, cond=eps * max(design.shape))[0][::-1]
+    padded = np.concatenate([np.zeros(half), values, np.zeros(half)])
+    begin = half - (window - 1) // 2  # in the padded values: an even window reaches one value further ahead than back
+    at = [padded[begin + k : begin + k + n] for k in range(window)]
+    if window % 2 and np.all(np.abs(weights - weights[::-1]) <= eps):  # the order of the sum
+        out = at[half] * weights[half]
+        for k in range(half):
+            out = out + (at[k] + at[-1 - k]) * weights[k]
+    elif window % 2 and np.all(np.abs(weights + weights[::-1]) <= eps):
+        out = at[half] * weights[half]
+        for k in range(half):
+            out = out + (at[k] - at[-1 - k]) * weights[k]
+    else:
+        out = at[-1] * weights[-1]
+        for k in range(window - 1):
+            out = out + at[k] * weights[k]
+    for start, first, last in ((0, 0, half), (n - window, n - half, n)):
+        fit = np.vander(np.arange(window, dtype=np.float64), order + 1)
+        scale = np.sqrt(np.sum(fit * fit, axis=0))
+        solved = scipy.linalg.lstsq(fit / scale, values[start : start + window, None], cond=window * eps)[0]
+        polynomial = np.polyder(solved[:, 0] / scale, times)
+        out[first:last] = np.polyval(polynomial, np.arange(first - start, last - start, dtype=np.float64)) / step**times
+    return np.asarray(out)
 
 
 def _enough(values: F64, order: int) -> int:

@@ -11,7 +11,7 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.core.types import F64, I64
@@ -38,7 +38,7 @@ def family_bounds(means: F64, family: I64) -> list[float]:
     """
     centre, sums = float(np.mean(means)), np.bincount(family, means - np.mean(means))
     n = len(sums)
-    half = float(stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1) * np.sum(sums**2)) / len(means))
+    half = float(scipy.special.stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1) * np.sum(sums**2)) / len(means))
     return [centre - half, centre + half]
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
+    CubicSpline,
     interpolate,
     inverse,
     matrix_from_quat,
@@ -105,3 +107,13 @@ def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends() -> None:
 def test_resampling_skips_repeated_points() -> None:
     line = np.array([[0.0, 0], [1.0, 0], [1.0, 0], [2.0, 0]])
     np.testing.assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])
+
+
+@pytest.mark.parametrize("points", [2, 3, 4, 5, 30])
+@pytest.mark.parametrize("derivative", [0, 1, 2])
+def test_a_spline_is_scipys_to_the_last_bit(points: int, derivative: int) -> None:
+    random = np.random.default_rng(points)
+    at = np.cumsum(random.uniform(0.01, 5.0, points))
+    line = 1e4 * random.normal(size=(points, 3))
+    asked = np.concatenate([at, random.uniform(at[0], at[-1], 40), [at[0] - 1.0, at[-1] + 1.0]])  # knots, between them, outside
+    np.testing.assert_array_equal(CubicSpline(at, line)(asked, derivative), scipy.interpolate.CubicSpline(at, line)(asked, derivative))

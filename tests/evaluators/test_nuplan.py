@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 import shapely
 
 from evaluators.scores import nuplan
-from evaluators.scores.states import EgoStates, Tracks
+from evaluators.scores.states import EgoStates, Tracks, savitzky_golay
 
 FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtures"
 OF_PLANS = ("planner_expert_average_l2_error_within_bound", "planner_miss_rate_within_bound")  # they compare plans; the files hold drives
@@ -102,3 +103,12 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
         own = ego.boxes(ego.centre + after_s * ego.speed[:, None] * ego.heading, ego.yaw).shapes()
         hit = shapely.intersects(own, others.boxes(everyone, steps, after_s).shapes())
         assert hit.tolist() == ((first_s <= after_s) & (after_s <= last_s)).tolist()
+
+
+@pytest.mark.parametrize(("values", "window"), [(5, 5), (8, 8), (9, 8), (40, 8), (40, 15), (3, 3), (4, 4)])
+@pytest.mark.parametrize("times", [0, 1, 2])
+def test_smoothing_is_scipys_to_the_last_bit(values: int, window: int, times: int) -> None:
+    random = np.random.default_rng(values)
+    for given in (1e3 * random.normal(size=values), np.zeros(values), np.arange(float(values))):
+        ours = savitzky_golay(given, window, 2, times, 0.1)
+        np.testing.assert_array_equal(ours, scipy.signal.savgol_filter(given, window, 2, deriv=times, delta=0.1))
