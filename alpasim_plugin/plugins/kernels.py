@@ -1,8 +1,8 @@
 """Compiled kernels: those that lie in the package, the user's own cache, and numba's compiler, in this order.
 
-COMPILED / PYTHON-NUMBA-LLVMLITE-TRIPLE-LEVEL /            what one version of the compiler made for one level of processors
-                                    SUBJECT-DIGEST         empty: the folder has all that the subject's case calls
-                                    KERNEL-DIGEST          one kernel for arguments of one kind: a pickle, as in numba's own cache
+MADE / compiled / PYTHON-NUMBA-LLVMLITE-TRIPLE-LEVEL /            what one version of the compiler made for one level of processors
+                                           SUBJECT-DIGEST         empty: the folder has all that the subject's case calls
+                                           KERNEL-DIGEST          one kernel for arguments of one kind: a pickle, as in numba's own cache
 
 A kernel is named by its arguments and by the code of its module with everything that it imports: where a constant was edited it is
 compiled anew, in the user's cache too, which numba names by the kernel's own file alone.
@@ -29,10 +29,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.io.places import PACKAGE
+from alpasim_plugin.io.places import MADE
 from alpasim_plugin.plugins.parts.source import own_code_digest
 
-COMPILED = PACKAGE / "compiled"
+COMPILED = MADE / "compiled"
 SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
     "rasteriser": "alpasim_plugin.gaussians.sample_scene:rasterise",
     "gradient": "alpasim_plugin.gaussians.sample_scene:fit",

@@ -170,7 +170,7 @@ def test_an_installed_wheel_compiles_nothing(built: list[Path], tmp_path: Path) 
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(root / name, source / name)
     for folder in built:
-        shutil.copytree(folder, source / "alpasim_plugin" / "compiled" / folder.name)
+        shutil.copytree(folder, source / "alpasim_plugin" / "made" / "compiled" / folder.name)
     pip = [sys.executable, "-m", "pip", "-q"]
     subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(tmp_path), str(source)], check=True)
     subprocess.run([*pip, "install", "--no-deps", "--target", str(site), *map(str, tmp_path.glob("*.whl"))], check=True)
