@@ -57,7 +57,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**options)(function)
-        if hasattr(kernel, "_cache"):  # not where kernels are interpreted
+        if options.get("cache") and hasattr(kernel, "_cache"):  # not where kernels are interpreted
             kernel._cache = _Compiled(kernel._cache, function)
         return kernel
 
@@ -68,39 +68,34 @@ class _Compiled:
     """What numba asks for a kernel: its own cache, preceded by what lies in the package."""
 
     def __init__(self, cached: Any, function: Callable[..., Any]) -> None:
-        self._cached, self._function = cached, function
+        self._cached, self._name_of_kernel = cached, function.__qualname__
+        self._code = _code(function.__module__)  # now: the file may be edited before the first call compiles what was imported
+        cached._cache_file._source_stamp = self._code
 
     def load_overload(self, sig, target_context):
-        folder = shipped()
+        """Return a kernel that was compiled for arguments of these types; None where there is none."""
         if _filled is not None:
             return None
-        if folder is not None:
-            try:
-                content = (folder / self._name(sig)).read_bytes()
-            except FileNotFoundError:
-                pass
-            else:
-                from numba.core.compiler import CompileResult
+        folder = shipped()
+        path = None if folder is None else folder / self._name(sig)
+        if path is None or not path.exists():
+            return self._cached.load_overload(sig, target_context)
+        from numba.core.compiler import CompileResult
 
-                target_context.refresh()
-                return CompileResult._rebuild(target_context, *pickle.loads(content))
-        return self._stamped().load_overload(sig, target_context)
+        target_context.refresh()
+        return CompileResult._rebuild(target_context, *pickle.loads(path.read_bytes()))
 
     def save_overload(self, sig, data):
+        """Keep what was just compiled: in the user's cache, or in the folder that is being filled."""
         if _filled is None:
-            self._stamped().save_overload(sig, data)
-        else:
-            from numba.core.serialize import dumps
+            self._cached.save_overload(sig, data)
+            return
+        from numba.core.serialize import dumps
 
-            (_filled / self._name(sig)).write_bytes(dumps(data._reduce()))
+        (_filled / self._name(sig)).write_bytes(dumps(data._reduce()))
 
     def _name(self, sig) -> str:
-        facts = f"{_code(self._function.__module__)} {sig}"
-        return f"{self._function.__qualname__}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
-
-    def _stamped(self) -> Any:
-        self._cached._cache_file._source_stamp = _code(self._function.__module__)
-        return self._cached
+        return f"{self._name_of_kernel}-{hashlib.blake2b(f'{self._code} {sig}'.encode(), digest_size=8).hexdigest()}"
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._cached, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -57,6 +58,12 @@ def test_an_edited_constant_is_served_neither_from_the_package_nor_from_the_cach
     assert ask() == [32, 1]  # from the cache
     edit(64)
     assert ask() == [64, 0]
+
+
+def test_kernels_of_the_core_are_all_made_here() -> None:
+    rooms = [room for room in PACKAGE.iterdir() if room.is_dir() and room.name != "lab"]  # another distribution
+    texts = {path: path.read_text() for room in rooms for path in room.rglob("*.py")}
+    assert [str(path) for path, text in texts.items() if re.search(r"from numba import .*njit|numba\.njit\(", text)] == [kernels.__file__]
 
 
 @pytest.mark.parametrize(
