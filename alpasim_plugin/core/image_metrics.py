@@ -1,4 +1,4 @@
-"""PSNR and SSIM of images: one definition of each for every table, report and training log.
+"""What images are judged by: one definition of PSNR, SSIM and a black picture for every stage, table, report and training log.
 
 SSIM follows Wang et al., IEEE TIP 2004, Eq. 13, in the convention of the 3DGS papers: Gaussian window 11x11 with sigma 1.5, biased moments,
 zeros beyond the border, per channel, then the mean over pixels and channels. Other conventions differ by up to 0.005 on one pair of images.
@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F32
+from alpasim_plugin.core.types import F32, U8
 
 CAP_DB = 100.0  # of identical images, whose ratio is infinite
 WINDOW_PX, SIGMA_PX = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2  # for values in 0 to 1
-_KERNEL = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX, cv2.CV_32F)
+BLACK_MAX = 10  # uint8 sRGB value, 0..255: an image is black when no channel of any pixel is above it; AlpaSim's img_is_black
 
 Image = npt.NDArray[Any]
 
@@ -61,7 +60,20 @@ def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
 
 def gaussian_blur(image: F32) -> F32:
     """Return local means ``(H, W, C)`` under SSIM's window."""
-    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL, borderType=cv2.BORDER_CONSTANT))
+    import cv2  # not for those who only ask whether a picture is black
+
+    window = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX, cv2.CV_32F)
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, window, window, borderType=cv2.BORDER_CONSTANT))
+
+
+def is_black(rgb: U8) -> bool:
+    """Return whether every value of ``(H, W, 3)`` pixels is at most `BLACK_MAX`; an image without pixels is black.
+
+    Example:
+        >>> is_black(np.full((4, 4, 3), 10, np.uint8)), is_black(np.full((4, 4, 3), 11, np.uint8))
+        (True, False)
+    """
+    return int(rgb.max(initial=0)) <= BLACK_MAX
 
 
 def grid_ratio(images: Image, truths: Image, side: int = 4, flat_levels: float = 3.0) -> float | None:

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from alpasim_plugin.nets.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
 from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, MATCH_CELLS, NOWHERE, OFFSET_PX, BesideCells, BlendHeads
+from alpasim_plugin.plugins.kernels import njit
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 
@@ -299,18 +299,27 @@ def _exponentials(values):
 
 
 def draw_and_gather() -> None:
-    """Draw a line and a car, and gather a picture's cells: a tiny case that makes numba compile the kernels of what a fixer reads."""
+    """Draw a line and a car, carry a picture into another view and gather its cells: tiny cases of all kernels of what a fixer reads."""
     from alpasim_plugin.core.geometry import se2
     from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
+    from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, warp
     from alpasim_plugin.semantic_map.draw import draw_map
     from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
 
     side_px = 16
     ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x
     edge = np.array([[2.0, -1.0, 0.0], [9.0, 1.0, 0.0]])
-    camera = CameraSpec("front", side_px, side_px, np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), ahead)
-    car = ActorBox(se2(5.0, 0.0, 0.0, 0.8), Box(4.5, 1.9, 1.6), "car")
-    draw_map(prepare_map(LaneMap({}, road_edges=(edge,))), camera, ahead, [car], threads=1)
+    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
+    T_world_car, box = se2(5.0, 0.0, 0.0, 0.8), Box(4.5, 1.9, 1.6)
+    camera = CameraSpec("front", side_px, side_px, K, ahead)
+    draw_map(prepare_map(LaneMap({}, road_edges=(edge,))), camera, ahead, [ActorBox(T_world_car, box, "car")], threads=1)
+
+    depth = np.ones((side_px, side_px), np.float32)
+    picture = Picture(K, ahead, np.zeros((side_px, side_px, 3), np.uint8), depth, {"car": T_world_car})
+    warp(picture, WarpTarget(K, ahead, depth, {"car": T_world_car}), {"car": box})
+    for focal_px in (8.0, 80.0):  # the car fills a part of the picture's rows, and all of them
+        on_boxes(depth.shape, np.array([[focal_px, 0, 8], [0, focal_px, 8], [0, 0, 1]]), ahead, {"car": T_world_car}, {"car": box})
+
     image = torch.zeros(1, side_px, side_px, 3)
     state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image, image[..., :1])
     gather_cells_cpu(image, image[..., :1], image, state, image + 1)

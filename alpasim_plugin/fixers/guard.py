@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.pixels import is_black
+from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.types import U8
 
 NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"

@@ -1,7 +1,7 @@
 """Where files go that nobody named: one choice, made when the package is imported, before numba is.
 
 cache    $SIMRUN_CACHE; simrun below $XDG_CACHE_HOME or ~/.cache; a private temporary folder; nowhere
-kernels  $NUMBA_CACHE_DIR; beside their source; numba below the cache
+kernels  those in the wheel; $NUMBA_CACHE_DIR; beside their source; numba below the cache
 scratch  $SIMRUN_SCRATCH/simrun-USER-HOST; below the system's temporary folder, by a name that only this user's cache holds
 state    $SIMRUN_SLURM; simrun/slurm below $XDG_STATE_HOME or ~/.local/state
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
 PACKAGE = Path(__file__).resolve().parents[1]
+MADE = PACKAGE / "made"  # compiled kernels and reconstructions that lie in a wheel, as in a cache; nothing is written there
 CACHE, KERNELS, SCRATCH, STATE = "SIMRUN_CACHE", "NUMBA_CACHE_DIR", "SIMRUN_SCRATCH", "SIMRUN_SLURM"
 TEMPORARY = "simrun-cache-"  # then the process that made it
 SECRET = "scratch-name"  # file of the cache

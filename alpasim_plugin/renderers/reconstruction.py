@@ -29,6 +29,7 @@ from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.io.cache import cached
+from alpasim_plugin.io.places import MADE
 from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, in_memory, scene_key, scene_of
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, read_model, recipe_of, reconstruction_key
@@ -104,10 +105,12 @@ def model_of(scenario: Scenario, threads: int | None = None) -> Model:
 def ensure(
     scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None = None, *, again: bool = False
 ) -> tuple[Reconstruction, list[SkyView]]:
-    """Return a reconstruction and its sky views from the cache; it is fitted first if it is not there, or if ``again``."""
+    """Return a reconstruction and its sky views from wheel or cache; it is fitted first if neither has it, or if ``again``."""
+    key = reconstruction_key(scenario, recipe)
+    if not again and (MADE / KIND / key).is_dir():
+        return read_model(MADE / KIND / key)
     from alpasim_plugin.renderers.reconstruction_build import build  # needs torch, which a cached reconstruction does not
 
-    key = reconstruction_key(scenario, recipe)
     what = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
     return cached(KIND, key, partial(build, scenario, recipe, threads), read_model, what, again=again)
 

@@ -7,20 +7,19 @@ rasteriser is bit-equal for any number of threads. Workers may therefore run cel
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import alpasim_plugin
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.cache import cache_root, cached, share_measurements
+from alpasim_plugin.plugins import kernels
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.run_folder.manifests import write_manifest
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
@@ -34,12 +33,6 @@ from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.provenance import hardware
 
 KERNELS = "kernels"
-SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
-    "rasteriser": "alpasim_plugin.gaussians.sample_scene:rasterise",
-    "gradient": "alpasim_plugin.gaussians.sample_scene:fit",
-    "map": "alpasim_plugin.fixers.gather:draw_and_gather",
-}
-SOURCES = ("gaussians", "semantic_map", "fixers")  # where kernels are
 GAUSSIANS = ("clean", "3dgs")  # base renderers that draw Gaussians themselves
 
 
@@ -51,8 +44,10 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
         scenarios: Their scenarios by scene.
         workers: Processes. One compiles nothing here: it compiles while it drives.
     """
-    cold = [subject for subject in needed(todo, scenarios) if not (cache_root() / KERNELS / _key(subject)).exists()]
-    if workers < 2 or not cold:
+    if workers < 2:
+        return
+    cold = [one for one in needed(todo, scenarios) if not kernels.covers(one) and not (cache_root() / KERNELS / _key(one)).exists()]
+    if not cold:
         return
     for subject, got in run_in_processes(compile_kernels, cold, min(workers, len(cold)), 1):
         if isinstance(got, Lost):
@@ -60,7 +55,7 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
 
 
 def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:
-    """Return the subjects of `SUBJECTS` whose kernels some rollouts call."""
+    """Return the subjects of `kernels.SUBJECTS` whose kernels some rollouts call."""
     found = set()
     for cell in todo:
         if cell.renderer.base.name in GAUSSIANS:
@@ -69,28 +64,22 @@ def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]
             found.add("gradient")
         if cell.renderer.fixer is not None:
             found.add("map")
-    return [subject for subject in SUBJECTS if subject in found]
+    return [subject for subject in kernels.SUBJECTS if subject in found]
 
 
 def compile_kernels(subject: str) -> None:
     """Compile the kernels of a subject on a tiny case, unless that was done; wait where another process is about to."""
 
-    module, _, case = SUBJECTS[subject].partition(":")
-
     def make(folder: Path) -> None:
-        getattr(importlib.import_module(module), case)()
+        kernels.call(subject)
 
     cached(KERNELS, _key(subject), make, lambda folder: folder, f"compiling {subject} kernels, once on this machine")
 
 
-@cache
 def _key(subject: str) -> str:
-    """Name what is compiled as numba does: by the sources' times and sizes, its version, its folder, the processor."""
-    package = Path(alpasim_plugin.__file__).parent
-    sources = sorted(path for folder in SOURCES for path in (package / folder).rglob("*.py"))
-    stamps = [(str(path), (stat := path.stat()).st_mtime_ns, stat.st_size) for path in sources]
-    facts = repr((stamps, version("numba"), os.environ.get("NUMBA_CACHE_DIR"), hardware()["cpu"]))
-    return f"{subject}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
+    """Name what is compiled as numba does: by the code, numba's version, its folder, the processor."""
+    facts = repr((version("numba"), os.environ.get("NUMBA_CACHE_DIR"), hardware()["cpu"]))
+    return f"{kernels.subject_name(subject)}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
 
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from alpasim_plugin.core.errors import PolicyError, RendererError, SimrunError
-from alpasim_plugin.core.pixels import is_black
+from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
 from alpasim_plugin.plugins.interfaces import Policy, Renderer

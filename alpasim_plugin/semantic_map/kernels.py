@@ -11,8 +11,8 @@ Triangles are halved at an edge that bends; the decision looks at that edge alon
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from alpasim_plugin.plugins.kernels import njit
 from alpasim_plugin.semantic_map.prepare import GROUP
 
 BEND_PX = 0.1

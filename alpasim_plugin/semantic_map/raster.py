@@ -10,9 +10,9 @@ one thread in the order of the lists, so the image does not depend on the number
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from alpasim_plugin.gaussians.raster.simd import fetch_add
+from alpasim_plugin.plugins.kernels import njit
 from alpasim_plugin.semantic_map.kernels import (
     BACK,
     BIAS,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.core.pixels import is_black
+from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.types import U8, LoggedImage, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.score import series, with_preset

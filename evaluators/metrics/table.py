@@ -12,7 +12,7 @@ from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.pixels import BLACK_MAX
+from alpasim_plugin.core.image_metrics import BLACK_MAX
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.core.types import MetricInfo as MetricInfo
 from evaluators.scores.table import BENCHMARKS

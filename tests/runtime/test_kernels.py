@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.io.cache import cache_root
-from alpasim_plugin.runtime.execute import KERNELS, SUBJECTS, compile_for, compile_kernels, needed
+from alpasim_plugin.plugins.kernels import SUBJECTS
+from alpasim_plugin.runtime.execute import KERNELS, compile_for, compile_kernels, needed
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import ScenarioRef
 
@@ -50,7 +51,8 @@ def test_one_worker_compiles_while_it_drives_and_two_beforehand(tmp_path: Path, 
 COMPILED_LATER = """
 import sys
 from numba.core import event
-from alpasim_plugin.runtime.execute import SUBJECTS, compile_kernels
+from alpasim_plugin.plugins.kernels import SUBJECTS
+from alpasim_plugin.runtime.execute import compile_kernels
 
 class Compiled(event.Listener):
     names = []

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
@@ -55,6 +54,7 @@ from alpasim_plugin.gaussians.raster.gradient_kernels import (
     basis_gradient,
     write_basis,
 )
+from alpasim_plugin.plugins.kernels import njit
 
 _f = np.float32
 

@@ -15,7 +15,6 @@ polynomial of degree 5 for ``2^(y - 0.5)``: relative error below 2e-6, without r
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.polynomial import chebyshev
 
 from alpasim_plugin.gaussians.constants import (
@@ -39,6 +38,7 @@ from alpasim_plugin.gaussians.constants import (
     Z,
 )
 from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.plugins.kernels import njit
 
 _f = np.float32
 _nodes = np.cos(np.pi * (np.arange(6) + 0.5) / 6) / 2  # interpolation at Chebyshev nodes of [-0.5, 0.5]

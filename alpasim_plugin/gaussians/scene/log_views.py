@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.plugins.kernels import njit
 
 TOLERANCE, MARGIN_M = 0.06, 0.3  # a point this share of depth, plus this, behind the surface that was seen still counts as seen
 EDGE_SHARE = 0.05  # a Gaussian just outside the image still shows in it
@@ -67,7 +67,7 @@ class LogViews:
         return seen
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc,untyped-decorator,unused-ignore]
+@njit(cache=True, nogil=True)
 def _see(points: F64, size_m: F64, T: F64, K: F64, size: I64, first: I64, limit: F32, seen: Bool) -> None:
     """Test every point against the views in turn, beginning with the one that saw the point before it: neighbours share views."""
     n_views = T.shape[0]

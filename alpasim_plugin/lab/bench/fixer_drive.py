@@ -77,7 +77,7 @@ def drive(
     base = make_renderer(renderer, scenario, seed, "cpu", threads)
     fixer = _RecordingFixer(make_fixer(settings.name, settings, scene_id=scene_id, seed=seed, device=device, threads=threads))
     fixed = fixed_renderer(base.render, lambda: fixer, settings, scenario, threads)
-    recording = _RecordingRenderer(fixed)
+    recording = RecordingRenderer(fixed)
     with Recorder(scenario, seed, images="none") as recorder:
         run_rollout(scenario, recording, make_policy(policy, scenario), seed, recorder)
     given = [frame for block in fixer.given for frame in block]
@@ -125,23 +125,28 @@ class _RecordingFixer(Fixer):
         return self.fixer.step(block, maps)
 
 
-class _RecordingRenderer(Renderer):
-    """A renderer that records its frames and, per frame, the milliseconds by stage."""
+class RecordingRenderer(Renderer):
+    """A renderer that records requests, frames and, per frame, the milliseconds by stage."""
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
         self.lookahead, self.block = renderer.lookahead, renderer.block
+        self.requests: list[RenderRequest] = []
         self.frames: list[Frame] = []
         self.ms: list[dict[str, float]] = []
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
+        """Give what the renderer timed itself."""
         return self._renderer.stage_ms
 
     def render(self, request: RenderRequest) -> Frame:
+        """Render one frame."""
         return self.render_batch([request])[0]
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
+        """Render frames of one instant, or of a block."""
+        self.requests += requests
         frames = list(self._renderer.render_batch(requests))
         self.frames += frames
         self.ms += [{stage: ms / len(frames) for stage, ms in self.stage_ms.items()}] * len(frames)

@@ -23,7 +23,7 @@ NEAR = 0.15  # decades between points that share a label
 FEW = 3  # up to so many names are written to the right of their points, more to the left
 FLOOR = 1e-4  # grey levels; where the plot puts errors that are zero
 MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P", "guard": "v", "source": "<", "cameras": ">"}
-MARK = "<!-- bench fixer: {} -->"
+MARK = "<!-- bench: {} -->"
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -127,7 +127,7 @@ def _clusters(points: Sequence[tuple[Row, float, float]]) -> list[tuple[tuple[fl
 
 
 def put_between_marks(page: str, name: str, text: str) -> str:
-    """Replace the text of a page between ``<!-- bench fixer: NAME -->`` and ``<!-- bench fixer: end of NAME -->``.
+    """Replace the text of a page between ``<!-- bench: NAME -->`` and ``<!-- bench: end of NAME -->``.
 
     Raises:
         ValueError: When the page has no such marks.

@@ -12,6 +12,7 @@ from alpasim_plugin.lab.cli import (
     bench_evaluators,
     bench_executors,
     bench_fixer,
+    bench_loop,
     bench_presets,
     bench_profile,
     bench_real,
@@ -34,6 +35,7 @@ def bench() -> None:
 
 app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evaluators)
 app.command("executors", epilog=bench_executors.EPILOG)(bench_executors.executors)
+app.command("loop", epilog=bench_loop.EPILOG)(bench_loop.loop)
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
 app.command("profile", epilog=bench_profile.EPILOG)(bench_profile.profiles)

@@ -135,7 +135,7 @@ def test_the_table_has_a_line_per_row_and_the_plot_is_a_picture(rows: dict[str, 
 
 
 def test_only_what_lies_between_the_marks_is_replaced() -> None:
-    page = "a\n<!-- bench fixer: table -->\nold\n<!-- bench fixer: end of table -->\nb\n"
+    page = "a\n<!-- bench: table -->\nold\n<!-- bench: end of table -->\nb\n"
     assert put_between_marks(page, "table", "new\n") == page.replace("old", "new")
     with pytest.raises(ValueError, match="no marks"):
         put_between_marks("nothing", "table", "new")

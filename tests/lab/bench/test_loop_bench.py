@@ -1,0 +1,45 @@
+"""A record of speed has every stage with its error, and ratios that are those of its times."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.lab.bench import loop as module
+from alpasim_plugin.lab.bench.loop import STAGES, bench_loop, fastest, markdown, reference_ms
+from alpasim_plugin.lab.cli import bench_loop as command
+
+REPO = Path(__file__).resolve().parents[3]
+
+
+def test_each_pass_counts_with_its_least_time() -> None:
+    assert fastest([{"log": [3.0, 1.0]}, {"log": [2.0, 4.0]}], "log") == [2.0, 1.0]
+    with pytest.raises(ValueError, match="shorter"):
+        fastest([{"log": [3.0, 1.0]}, {"log": [2.0]}], "log")
+
+
+def test_the_reference_is_the_same_work_each_time() -> None:
+    assert reference_ms(times=3) > 0
+
+
+def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "COMMANDS", {"start": ("--version",)})
+    record = bench_loop(["clean"], repeats=1, seconds=0.5)
+    assert json.loads(json.dumps(record)) == record
+    (frame,), (start,) = record["frames"], record["commands"]
+    assert {"render", "policy", "control", "log"} <= set(frame["stages"]) <= set(STAGES)
+    assert frame["ms"] == pytest.approx(sum(stage["ms"] for stage in frame["stages"].values()))
+    assert frame["ratio"] == pytest.approx(frame["ms"] / record["reference_ms"])
+    assert start["ratio"] == pytest.approx(1e3 * start["processor_s"] / record["reference_ms"])
+    assert frame["psnr_db"] == 100  # the scene as built, against itself
+    assert frame["raster_levels"] <= 1
+    rows = [line.split("|") for line in markdown(record).splitlines() if line.startswith("|")]
+    assert {len(row) for row in rows[:3]} == {len(rows[0])}
+    assert [row[1].strip() for row in rows] == ["frame behind", "---", "`clean`", "command", "---", "start"]
+
+
+def test_the_page_holds_the_record_that_lies_beside_it() -> None:
+    record = json.loads((REPO / command.RECORD).read_text())
+    assert markdown(record) in (REPO / command.PAGE).read_text()
