@@ -30,7 +30,7 @@ from scenarios.load import load_scenario
 
 VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
 BASELINE = "3dgs"
-RENDERERS = ("clean", BASELINE, "onefixer", "onefixer-dit-tiny")
+RENDERERS = ("clean", BASELINE, "onefixer", "onefixer[references=0]")
 SECONDS_MOST = 21  # the scenes are drawn for 19.8 s
 EVENT = "offroad_or_collision_at_fault"
 SHOWN = ("collision_at_fault", "offroad", EVENT, "lateral_distance_m", "progress", "min_distance_to_obstacle_m")
