@@ -58,6 +58,8 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     r = np.asarray(rotation, dtype=np.float64)
     batch = r.shape[:-2]
     m = r.reshape(-1, 3, 3)
+    if len(m) == 1:
+        return np.array(_quat_of(*m.ravel().tolist())).reshape(*batch, 4)
     trace = np.trace(m, axis1=1, axis2=2)
     candidates = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
     largest = np.argmax(candidates, axis=1)
@@ -75,6 +77,26 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     quat = np.where(quat[:, :1] < 0, -quat, quat)
     return np.asarray(quat.reshape(*batch, 4), dtype=np.float64)
+
+
+def _quat_of(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float) -> tuple[float, float, float, float]:
+    """Return the quaternion of one matrix, given row by row: the arithmetic of `quat_from_matrix` without arrays, a tenth of its time."""
+    trace = a + e + i
+    candidates = (trace, a, e, i)
+    largest = candidates.index(max(candidates)) if trace == trace else 0  # NaN is the largest, as for arrays
+    if largest == 0:
+        w, x, y, z = 1 + trace, h - f, c - g, d - b
+    elif largest == 1:
+        w, x, y, z = h - f, 1 + a - e - i, b + d, c + g
+    elif largest == 2:
+        w, x, y, z = c - g, d + b, 1 + e - i - a, f + h
+    else:
+        w, x, y, z = d - b, g + c, h + f, 1 + i - a - e
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if norm == 0.0:
+        return math.nan, math.nan, math.nan, math.nan
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
 
 
 def se3(xyz: npt.ArrayLike, quat: npt.ArrayLike) -> F64:

@@ -117,3 +117,15 @@ def test_a_spline_is_scipys_to_the_last_bit(points: int, derivative: int) -> Non
     line = 1e4 * random.normal(size=(points, 3))
     asked = np.concatenate([at, random.uniform(at[0], at[-1], 40), [at[0] - 1.0, at[-1] + 1.0]])  # knots, between them, outside
     np.testing.assert_array_equal(CubicSpline(at, line)(asked, derivative), scipy.interpolate.CubicSpline(at, line)(asked, derivative))
+
+
+def test_one_quaternion_is_that_of_many_to_the_last_bit() -> None:
+    random = np.random.default_rng(0)
+    turned = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()  # 180 degrees about each axis
+    noisy = Rotation.random(200, random_state=1).as_matrix() * (1 + 1e-9 * random.normal(size=(200, 3, 3)))
+    planar = Rotation.from_rotvec(random.uniform(-4, 4, (50, 1)) * [0.0, 0.0, 1.0]).as_matrix()
+    matrices = np.concatenate([turned, np.eye(3)[None], noisy, planar, -turned])
+    many = quat_from_matrix(matrices)
+    np.testing.assert_array_equal(np.stack([quat_from_matrix(one) for one in matrices]), many)
+    assert not np.signbit(quat_from_matrix(np.eye(3))).any()
+    assert np.isnan(quat_from_matrix(np.full((3, 3), np.nan))).all()
