@@ -91,11 +91,10 @@ def gather_beside_cpu(references: Tensor, render: Tensor) -> BesideCells:
 def _gather_beside(references, render, mean4, mean2, each4, each2):
     batch, count, height, width, _ = references.shape
     share = np.float32(1.0) / np.float32(count)
-    run4, run2 = CELL * CHANNELS, DETAIL * CHANNELS  # values of a cell's row
     row, mean = np.empty(CHANNELS * width, np.float32), np.empty(CHANNELS * width, np.float32)
     for b in range(batch):
         for y in range(height):
-            i4, i2, at4, at2 = y // CELL, y // DETAIL, (y % CELL) * run4, (y % DETAIL) * run2
+            i4, i2, at4, at2 = y // CELL, y // DETAIL, (y % CELL) * CELL * CHANNELS, (y % DETAIL) * DETAIL * CHANNELS
             mean[:] = np.float32(0.0)
             for k in range(count):
                 picture, own = references[b, k, y], render[b, y]
@@ -106,19 +105,28 @@ def _gather_beside(references, render, mean4, mean2, each4, each2):
                     row[CHANNELS * x + 3] = holds
                 for i in range(len(row)):
                     mean[i] += row[i] * share
-                _put_runs(row, each4[b * count + k, i4], at4, run4)
-                _put_runs(row, each2[b * count + k, i2], at2, run2)
-            _put_runs(mean, mean4[b, i4], at4, run4)
-            _put_runs(mean, mean2[b, i2], at2, run2)
+                _put_runs_of_16(row, each4[b * count + k, i4], at4)
+                _put_runs_of_8(row, each2[b * count + k, i2], at2)
+            _put_runs_of_16(mean, mean4[b, i4], at4)
+            _put_runs_of_8(mean, mean2[b, i2], at2)
 
 
 @njit(cache=True, nogil=True)
-def _put_runs(row, cells, at, run):
-    """Write a row of pixels into the row of cells that it crosses, ``run`` values into each, from ``at`` on."""
+def _put_runs_of_16(row, cells, at):
+    """Write a row of pixels into the row of cells of 4 x 4 that it crosses, from ``at`` on. The length is fixed, so that a run is a vector."""
     for j in range(cells.shape[0]):
         cell = cells[j]
-        for i in range(run):
-            cell[at + i] = row[run * j + i]
+        for i in range(CELL * CHANNELS):
+            cell[at + i] = row[CELL * CHANNELS * j + i]
+
+
+@njit(cache=True, nogil=True)
+def _put_runs_of_8(row, cells, at):
+    """Write a row of pixels into the row of cells of 2 x 2 that it crosses, from ``at`` on."""
+    for j in range(cells.shape[0]):
+        cell = cells[j]
+        for i in range(DETAIL * CHANNELS):
+            cell[at + i] = row[DETAIL * CHANNELS * j + i]
 
 
 @torch.library.custom_op("simrun::likeness", mutates_args=(), device_types="cpu")
@@ -302,6 +310,7 @@ def draw_and_gather() -> None:
     """Draw a line and a car, carry a picture into another view and gather its cells: tiny cases of all kernels of what a fixer reads."""
     from alpasim_plugin.core.geometry import se2
     from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
+    from alpasim_plugin.fixers.trust import trust
     from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, warp
     from alpasim_plugin.semantic_map.draw import draw_map
     from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
@@ -329,3 +338,4 @@ def draw_and_gather() -> None:
     heads = BlendHeads(offset_px.repeat(1, 1, 1, 1, 2), offset_px, offset_px.repeat(1, 1, 1, 1, 6))
     likeness_cpu(at4, at4)
     mix_cpu(image, references, heads)
+    trust(image[0].numpy(), image[0].numpy(), image[0, ..., 0].numpy())

@@ -1,11 +1,15 @@
 """Where a fixed picture comes from, as facts of its frame: recorded frames, the render, or the fixer itself."""
 
+# Numba's decorators are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
 from __future__ import annotations
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, F64, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
+from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
+from alpasim_plugin.plugins.kernels import njit
 
 MADE_UP = 0.25  # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
 CELL_PX, MOST_COLUMNS = 16, 32  # side of a cell; a picture wider than 512 pixels has larger ones
@@ -21,25 +25,33 @@ def trust(output: F32, render: F32, recorded: F32) -> dict[str, float | str]:
 
     Returns:
         `RECORDED_SHARE` and `GUESSED_SHARE`: means over the picture. `TRUST_CELLS`: both by cell, as `trust_cells` reads it. Sums are
-        numpy's, in double precision: those of torch depend in their last bits on the number of threads, and facts must not.
+        in double precision and in one order: those of torch depend in their last bits on the number of threads, and facts must not.
     """
-    apart = np.abs(output - render)
-    own = (apart[..., 0] + apart[..., 1] + apart[..., 2]) * np.float32(1 / (3 * MADE_UP))
-    guessed = np.minimum(own, 1) * (1 - recorded)
     height, width = recorded.shape
     side = max(CELL_PX, -(-width // MOST_COLUMNS))
-    edges = [np.arange(0, length, side) for length in (height, width)]
+    sums = np.zeros((-(-height // side), -(-width // side), 2))
+    _add_shares(*(np.ascontiguousarray(x) for x in (output, render, recorded)), side, sums)
+    pixels = np.outer(*(np.diff(np.arange(0, length, side), append=length) for length in (height, width)))
+    digits = np.rint(sums / pixels[..., None] * LEVELS).astype(np.uint8)
+    recorded_share, guessed_share = (float(share) for share in sums.sum(axis=(0, 1)) / recorded.size)
+    text = digits.tobytes().hex()[1::2]  # of a byte's two digits the second: it is at most fifteen
+    return {RECORDED_SHARE: recorded_share, GUESSED_SHARE: guessed_share, TRUST_CELLS: f"{sums.shape[1]}x{sums.shape[0]}:{text}"}
 
-    def by_cell(shares: F32) -> F64:
-        """Return the mean of every cell."""
-        sums = np.add.reduceat(np.add.reduceat(shares, edges[0], axis=0, dtype=np.float64), edges[1], axis=1)
-        means: F64 = sums / np.outer(*(np.diff(edge, append=length) for edge, length in zip(edges, (height, width), strict=True)))
-        return means
 
-    digits = np.rint(np.stack([by_cell(recorded), by_cell(guessed)], axis=-1) * LEVELS).astype(int)
-    text = "".join(f"{digit:x}" for digit in digits.ravel().tolist())
-    means = {name: float(shares.mean(dtype=np.float64)) for name, shares in ((RECORDED_SHARE, recorded), (GUESSED_SHARE, guessed))}
-    return {**means, TRUST_CELLS: f"{digits.shape[1]}x{digits.shape[0]}:{text}"}
+@njit(cache=True, nogil=True)
+def _add_shares(output, render, recorded, side, sums):
+    """Add the recorded and the made-up share of every pixel to its cell, in double precision and row by row."""
+    scale = np.float32(1 / (3 * MADE_UP))
+    height, width = recorded.shape
+    for row in range(height):
+        for column in range(width):
+            apart = abs(output[row, column, 0] - render[row, column, 0])
+            apart += abs(output[row, column, 1] - render[row, column, 1])
+            apart += abs(output[row, column, 2] - render[row, column, 2])
+            share = recorded[row, column]
+            cell = sums[row // side, column // side]
+            cell[0] += share
+            cell[1] += min(apart * scale, np.float32(1.0)) * (np.float32(1.0) - share)
 
 
 def trust_cells(text: str) -> U8:
