@@ -113,7 +113,7 @@ def _gather_beside(references, render, mean4, mean2, each4, each2):
 
 @njit(cache=True, nogil=True)
 def _put_runs_of_16(row, cells, at):
-    """Write a row of pixels into the row of cells of 4 x 4 that it crosses, from ``at`` on. The length is fixed, so that a run is a vector."""
+    """Write a row of pixels into the row of cells of 4 x 4 that it crosses, from ``at`` on. A run is a vector."""
     for j in range(cells.shape[0]):
         cell = cells[j]
         for i in range(CELL * CHANNELS):
