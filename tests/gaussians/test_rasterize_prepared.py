@@ -197,12 +197,13 @@ def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monke
         table = records[: count * RECORD].reshape(count, RECORD).copy()
         table[:, [RADIUS_X, RADIUS_Y, BLOCK_REACH]] = 1e30
         n_tiles = len(starts) - 1
-        full = np.tile(np.arange(count, dtype=np.int32), n_tiles)
+        full = np.tile((seen["order"][:count] & 0xFFFFFFFF).astype(np.int32), n_tiles)
         raster_tiles(cursor, tiles_x, np.arange(n_tiles + 1) * count, full, table.reshape(-1), background, rgb, alpha, depth)
 
     def counted(count, *args):
         seen["count"] = count
-        return depth_order(count, *args)
+        seen["order"] = depth_order(count, *args)
+        return seen["order"]
 
     monkeypatch.setattr(cpu, "depth_order", counted)
     monkeypatch.setattr(cpu, "raster_tiles", everywhere)

@@ -168,10 +168,10 @@ def _count_box(changes, stride, left, right, top, bottom):
 
 
 @njit(cache=True, nogil=True)
-def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, boxes, histogram):
-    """Copy records into depth order and count, per chunk of ``chunk_size`` splats, how many meet each tile.
+def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, boxes, histogram):
+    """Count, per chunk of ``chunk_size`` splats in the order of depth, how many meet each tile.
 
-    ``boxes`` takes four int32 per splat, the tiles of its box. A row of ``histogram`` takes changes of the counts from tile to tile.
+    ``boxes`` takes four int32 per rank, the tiles of the splat's box. A row of ``histogram`` takes changes of the counts from tile to tile.
     """
     n_chunks, stride = histogram.shape[0], tiles_x + 1
     while True:
@@ -182,13 +182,12 @@ def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y
         changes[:] = 0
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
             v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
-            source, at = (order[rank] & _LOW) * RECORD, rank * RECORD
-            v.store(ordered, at, v.load(records, source))
-            left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
+            at = (order[rank] & _LOW) * RECORD
+            left, right, top, bottom = _tile_box(records, at, tiles_x, tiles_y)
             boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3] = left, right, top, bottom
             if _is_large(left, right, top, bottom):
                 for row in range(top, bottom):
-                    first, end = _ellipse_columns(ordered, at, row, tiles_x)
+                    first, end = _ellipse_columns(records, at, row, tiles_x)
                     _count_box(changes, stride, first, end, row, row + 1)
             else:
                 _count_box(changes, stride, left, right, top, bottom)
@@ -222,17 +221,17 @@ def tile_offsets(histogram, tiles_x, starts):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _append(lists, position, tile, rank, present, nowhere):
-    """Append a rank to a tile's list, or write it to ``nowhere``: no branch, since nobody could foresee it."""
-    lists[position[tile] if present else nowhere] = rank
+def _append(lists, position, tile, record, present, nowhere):
+    """Append a record's number to a tile's list, or write it to ``nowhere``: no branch, since nobody could foresee it."""
+    lists[position[tile] if present else nowhere] = record
     position[tile] += 1 if present else 0
 
 
 @njit(cache=True, nogil=True)
-def fill_tiles(cursor, count, chunk_size, ordered, boxes, tiles_x, histogram, pairs, lists):
-    """Write each tile's list of ranks; chunks ascend and so do the ranks in a chunk, hence every list is in depth order.
+def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, pairs, lists):
+    """Write each tile's list of records; chunks ascend and so do the ranks in a chunk, hence every list is in depth order.
 
-    ``lists`` has room for one rank more than there are ``pairs``.
+    ``lists`` has room for one more than there are ``pairs``.
     """
     n_chunks, stride = histogram.shape[0], tiles_x + 1
     while True:
@@ -241,20 +240,21 @@ def fill_tiles(cursor, count, chunk_size, ordered, boxes, tiles_x, histogram, pa
             return
         position = histogram[chunk]
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
+            record = np.int32(order[rank] & _LOW)
             left, right, top, bottom = boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3]
             rows, columns = bottom - top, right - left
             if rows <= 2 and columns <= 2:
                 tile = top * stride + left
                 some, wide = rows > 0, columns > 1
-                _append(lists, position, tile, rank, some & (columns > 0), pairs)
-                _append(lists, position, tile + 1, rank, some & wide, pairs)
-                _append(lists, position, tile + stride, rank, (rows > 1) & (columns > 0), pairs)
-                _append(lists, position, tile + stride + 1, rank, (rows > 1) & wide, pairs)
+                _append(lists, position, tile, record, some & (columns > 0), pairs)
+                _append(lists, position, tile + 1, record, some & wide, pairs)
+                _append(lists, position, tile + stride, record, (rows > 1) & (columns > 0), pairs)
+                _append(lists, position, tile + stride + 1, record, (rows > 1) & wide, pairs)
                 continue
             large = _is_large(left, right, top, bottom)
             for row in range(top, bottom):
                 if large:
-                    left, right = _ellipse_columns(ordered, rank * RECORD, row, tiles_x)
+                    left, right = _ellipse_columns(records, np.int64(record) * RECORD, row, tiles_x)
                 for tile in range(row * stride + left, row * stride + right):
-                    lists[position[tile]] = rank
+                    lists[position[tile]] = record
                     position[tile] += 1

@@ -34,7 +34,7 @@ from alpasim_plugin.gaussians.constants import (
     SPHERE_SIZE,
     TILE,
 )
-from alpasim_plugin.gaussians.raster.binning import depth_order, fill_tiles, gather_and_count, tile_offsets
+from alpasim_plugin.gaussians.raster.binning import count_tiles, depth_order, fill_tiles, tile_offsets
 from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
@@ -107,11 +107,13 @@ def rasterize_prepared(
         )  # fmt: skip
     count = int(cursor[1])
 
-    tiles = list_per_tile(count, records, ids, camera, threads, _buffers)
+    keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
+    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
+    tiles = list_per_tile(count, order, records, camera, threads, _buffers)
     shape = (camera.height, camera.width)
     rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
     cursor[:] = 0
-    run_on_threads(threads, raster_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, behind, rgb, alpha, depth)
+    run_on_threads(threads, raster_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, records, behind, rgb, alpha, depth)
     stats = {"gaussians": sum(p.n_input for p, _ in nodes), "visible": count, "pairs": tiles.pairs, "pairs_looked_at": int(cursor[1])}
     return RasterOutput(rgb, alpha, depth, stats)
 
@@ -131,33 +133,26 @@ def camera_numbers(camera: PinholeCamera, lod_px: float = 0.0) -> F32:
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Visible splats in the order of depth, and which of them each tile may show.
+    """Which visible splats each tile may show, nearest first.
 
     Attributes:
         columns: Tiles in a row of tiles.
-        order: int64; its low 32 bits name the record of each rank.
-        ordered: float32, RECORD per rank.
         starts: int64, where each tile's list begins, and the end of the last.
-        lists: int32, ranks, ascending within a tile.
+        lists: int32, numbers of records, in the order of depth within a tile.
         pairs: Entries of ``lists`` in use.
     """
 
     columns: int
-    order: npt.NDArray[np.generic]
-    ordered: npt.NDArray[np.generic]
     starts: npt.NDArray[np.int64]
     lists: npt.NDArray[np.generic]
     pairs: int
 
 
 def list_per_tile(
-    count: int, records: npt.NDArray[np.generic], ids: npt.NDArray[np.generic], camera: PinholeCamera, threads: int, buffers: Buffers
+    count: int, order: npt.NDArray[np.generic], records: npt.NDArray[np.generic], camera: PinholeCamera, threads: int, buffers: Buffers
 ) -> TileLists:
-    """Sort ``count`` projected records by depth and list them per tile; the arrays returned belong to ``buffers``."""
+    """List ``count`` projected records per tile; ``order`` is that of `depth_order`. The lists belong to ``buffers``."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    keys, spare = buffers.get("keys", count, np.int64), buffers.get("spare", count, np.int64)
-    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
-    ordered = buffers.get("ordered", count * RECORD, np.float32)
     # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
     chunk_size = max(2048, -(-count // 64))
     n_chunks, room = -(-count // chunk_size), (tiles_x + 1) * (tiles_y + 2) + 1
@@ -166,12 +161,12 @@ def list_per_tile(
     starts = np.empty(tiles_x * tiles_y + 1, np.int64)
     cursor = np.zeros(2, np.int64)
     workers = threads if count > WORTH_THREADS else 1
-    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, boxes, histogram)
+    run_on_threads(workers, count_tiles, cursor, count, chunk_size, order, records, tiles_x, tiles_y, boxes, histogram)
     pairs = int(tile_offsets(histogram, tiles_x, starts))
     lists = buffers.get("lists", pairs + 1, np.int32)
     cursor[:] = 0
-    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, boxes, tiles_x, histogram, pairs, lists)
-    return TileLists(tiles_x, order, ordered, starts, lists, pairs)
+    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, pairs, lists)
+    return TileLists(tiles_x, starts, lists, pairs)
 
 
 def node_poses(

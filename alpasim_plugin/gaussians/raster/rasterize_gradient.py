@@ -18,6 +18,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.constants import BUNDLE, GEO_SIZE, NEAR_M, POSE_CENTRE, RADIUS_X, RADIUS_Y, RECORD
+from alpasim_plugin.gaussians.raster.binning import depth_order
 from alpasim_plugin.gaussians.raster.gradient_kernels import KEPT, PAIR, colour_splats, composite_tiles, tile_gradients
 from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
@@ -70,6 +71,7 @@ class _Kept:
     """What the forward pass keeps for the backward pass."""
 
     tiles: TileLists
+    records: F32  # RECORD per rank
     gaussian: npt.NDArray[np.int64]  # (M,) which Gaussian each rank shows
     pixels: F32  # per tile, see gradient_kernels
 
@@ -79,8 +81,8 @@ def _chunk(count: int) -> int:
     return max(512, -(-count // 64))
 
 
-def _project(p: _Parameters, view: _View) -> tuple[TileLists, npt.NDArray[np.int64]]:
-    """Project, sort and list the splats, colours included."""
+def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[np.int64]]:
+    """Project, sort and list the splats, colours included; returns the lists, the records by rank and which Gaussian each shows."""
     n = len(p.means)
     groups = -(-n // _LANES)
     lane_means, geometry = np.empty(groups * 3 * _LANES), np.zeros(groups * GEO_SIZE * _LANES, np.float32)
@@ -104,9 +106,12 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, npt.NDArray[np.int
     run_on_threads(workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records)
     if cursor[1]:
         _refuse(p, -1)
-    tiles = list_per_tile(count, records, ids, view.camera, view.threads, buffers)
-    gaussian = np.asarray(ids[tiles.order[:count] & 0xFFFFFFFF], np.int64)  # type: ignore[operator]
-    return tiles, gaussian
+    keys, spare = buffers.get("keys", count, np.int64), buffers.get("spare", count, np.int64)
+    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)[:count] & 0xFFFFFFFF
+    # In the order of depth, so that numbers ascend within a tile and the pairs of a range of splats are found by bisection.
+    ordered = records[: n * RECORD].reshape(n, RECORD)[order].reshape(-1)
+    tiles = list_per_tile(count, np.arange(count), ordered, view.camera, view.threads, buffers)
+    return tiles, np.asarray(ordered, np.float32), np.asarray(ids[order], np.int64)
 
 
 def _refuse(p: _Parameters, bad: int) -> None:
@@ -129,18 +134,18 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: Tensor, sh: Tensor, view: _View, screen: ScreenStatistics
     ) -> tuple[Tensor, Tensor, Tensor]:
         p = _Parameters.of(means, log_scales, quaternions, logits, sh)
-        tiles, gaussian = _project(p, view)
+        tiles, records, gaussian = _project(p, view)
         shape = (view.camera.height, view.camera.width)
         colour, alpha, depth_sum = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
         pixels = np.empty((len(tiles.starts) - 1) * _LANES * KEPT, np.float32)
         cursor = np.zeros(1, np.int64)
         run_on_threads(
-            view.threads, composite_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, pixels, colour, alpha, depth_sum
+            view.threads, composite_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, records, pixels, colour, alpha, depth_sum
         )
-        boxes = np.asarray(tiles.ordered[: len(gaussian) * RECORD]).reshape(-1, RECORD)[:, [RADIUS_X, RADIUS_Y]]
+        boxes = records.reshape(-1, RECORD)[:, [RADIUS_X, RADIUS_Y]]
         screen.radii[torch.from_numpy(gaussian)] = torch.from_numpy(np.ceil(boxes.max(axis=1, initial=0.0)).astype(np.int32))
         ctx.save_for_backward(means, log_scales, quaternions, logits, sh)
-        ctx.view, ctx.screen, ctx.kept = view, screen, _Kept(tiles, gaussian, pixels)
+        ctx.view, ctx.screen, ctx.kept = view, screen, _Kept(tiles, records, gaussian, pixels)
         return torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth_sum)
 
     @staticmethod
@@ -153,7 +158,7 @@ class _Rasterize(torch.autograd.Function):
         pairs = np.zeros(tiles.pairs * PAIR, np.float32)
         cursor = np.zeros(1, np.int64)
         run_on_threads(
-            view.threads, tile_gradients, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, kept.pixels, g_colour, g_alpha,
+            view.threads, tile_gradients, cursor, tiles.columns, tiles.starts, tiles.lists, kept.records, kept.pixels, g_colour, g_alpha,
             g_depth, pairs,
         )  # fmt: skip
         out = [np.zeros(a.shape, a.dtype) for a in (p.means, p.log_scales, p.quaternions, p.logits, p.sh)]
@@ -162,7 +167,7 @@ class _Rasterize(torch.autograd.Function):
         workers = view.threads if len(kept.gaussian) > WORTH_THREADS else 1
         cursor[:] = 0
         run_on_threads(
-            workers, sum_pairs, cursor, _chunk(len(kept.gaussian)), kept.gaussian, tiles.starts, tiles.lists, pairs, tiles.ordered, sums
+            workers, sum_pairs, cursor, _chunk(len(kept.gaussian)), kept.gaussian, tiles.starts, tiles.lists, pairs, kept.records, sums
         )
         cursor[:] = 0
         run_on_threads(
