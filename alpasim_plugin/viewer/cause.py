@@ -25,7 +25,7 @@ from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, lens_data, 
 from alpasim_plugin.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from alpasim_plugin.viewer.page import as_json, fill
 from alpasim_plugin.viewer.pictures import frame_rows, jpeg, seen_before, smaller
-from evaluators.metrics.outcomes import OUTCOMES, in_words, outcomes_of
+from evaluators.metrics.outcomes import first_failure, in_words, outcomes_of
 from evaluators.opening import Run
 
 DOING = "writing the page of a cause"
@@ -232,7 +232,8 @@ def heat_png(values: npt.NDArray[Any]) -> str:
 
 def failed_at(manifest: Mapping[str, Any]) -> int | None:
     """Return when a drive failed first, microseconds; None where it did not."""
-    return min((int(event["t_us"]) for event in manifest.get("events") or () if event["metric"] in OUTCOMES), default=None)
+    first = first_failure(manifest)
+    return None if first is None else int(first["t_us"])
 
 
 def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:

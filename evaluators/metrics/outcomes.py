@@ -6,9 +6,9 @@ be there, a place at which the recording was slow as well, or the end of the pat
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -57,6 +57,7 @@ OUTCOMES = {  # the gravest first
     )
 }
 NO_OUTCOME = "no event"
+CONTACT_SIDES = ("collision_front", "collision_lateral", "collision_rear")  # events name a contact by its side
 REACHED = 0.95  # share of the recorded path from which on a drive has reached its end
 
 
@@ -81,6 +82,17 @@ def in_words(had: Iterable[str]) -> str:
         ('at-fault collision and off-road', 'no event')
     """
     return " and ".join(one.words for one in told(had)) or NO_OUTCOME
+
+
+def first_failure(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the event of a manifest with which its drive failed first, a contact at any side among them; None where it did not.
+
+    Example:
+        >>> first_failure({"events": [{"metric": "offroad", "t_us": 9}, {"metric": "collision_front", "t_us": 5}]})["t_us"]
+        5
+    """
+    failures = (one for one in manifest.get("events") or () if one["metric"] in OUTCOMES or one["metric"] in CONTACT_SIDES)
+    return min(failures, key=lambda one: int(one["t_us"]), default=None)
 
 
 def event_words(metric: str) -> str:

@@ -29,7 +29,7 @@ from alpasim_plugin.io.reading.images import decode_image
 from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Rollout, Series
 from alpasim_plugin.run_folder.schema import AGAIN, DOING, STRIP_NAME, WHY_NAME
-from evaluators.metrics.outcomes import OUTCOMES, has_ended, in_words, outcomes_of
+from evaluators.metrics.outcomes import OUTCOMES, first_failure, has_ended, in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
@@ -328,8 +328,7 @@ def _shot(run: Run, rollout: Rollout) -> Shot | None:
     times = [int(t) for t in manifest.get("strip_t_us") or ()]
     if path is None or not times:
         return None
-    events = [event for event in manifest.get("events") or () if event["metric"] in OUTCOMES]
-    first = min(events, key=lambda event: event["t_us"], default=None)
+    first = first_failure(manifest)
     k = min(USUAL_FRAME, len(times) - 1)
     if first is not None:
         k = min(range(len(times)), key=lambda i: abs(times[i] - int(first["t_us"])))

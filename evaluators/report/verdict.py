@@ -48,10 +48,25 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str, worst: Sequence[Mappin
 
 
 def worst_of(run: Run, verdict: GateVerdict, stored: Sequence[Row] | None = None) -> list[dict[str, Any]]:
-    """Return the pairs that did worst in every check that did not pass; ``stored``: rows of a stored baseline."""
+    """Return the pairs that did worst in every check that did not pass, once each, those of a shown regression first.
+
+    Args:
+        run: The run.
+        verdict: Of a gate.
+        stored: Rows of a stored baseline.
+    """
     rows = rows_of_run(run)
     base_rows = rows if stored is None else stored
-    return [pair for check in verdict.checks if check.cause != "pass" for pair in worst_pairs(check, run, rows, base_rows)]
+    checks = sorted((check for check in verdict.checks if check.cause != "pass"), key=lambda check: check.cause != "regression")
+    pairs: dict[tuple[str, ...], dict[str, Any]] = {}
+    for check in checks:
+        for pair in worst_pairs(check, run, rows, base_rows):
+            name = tuple(str(pair[key]) for key in ("metric", "renderer", "policy", "scene", "seed"))
+            if name not in pairs:
+                pairs[name] = pair
+            elif pairs[name]["was"] is None:  # a limit has no baseline, the margin of the same metric has
+                pairs[name] |= {"was": pair["was"]}
+    return list(pairs.values())
 
 
 def _content(run: Run) -> str:

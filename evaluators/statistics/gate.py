@@ -195,10 +195,12 @@ def judge_sides(
         side = sides[arm.policy][arm.renderer]
         other = _partner(arm, base, there, stored is not None) if has_margin else arm
         behind = as_policy(there[other.policy][other.renderer], arm.policy) if has_margin else side
-        for name, rule in spec.metrics.items():
-            metric = known.info(name)
+        for wanted, rule in spec.metrics.items():
+            metric = known.info(wanted)
             if rule.margin is not None:
-                checks.append(_margin(side, behind, (arm.renderer, arm.policy), short_name(other, arm), metric, rule, spec))
+                name = short_name(other, arm)
+                against = name if stored is None else f"{name} of {stored_name or 'the baseline'}"  # else it reads "clean against clean"
+                checks.append(_margin(side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec))
             if rule.max is not None or rule.min is not None:
                 checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
     found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
@@ -263,11 +265,13 @@ def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored:
     )
 
 
-def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec) -> Check:
+def _margin(
+    side: Side, base: Side, variant: tuple[str, str], name: str, against: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec
+) -> Check:
     entry = compare(side, base, metric, name, rule.margin or 0.0)
     planned = entry["n_cells"] + entry["n_missing"]
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
-    said = _paired_text(entry, metric.name, variant[0])
+    said = _paired_text(entry, metric.name, variant[0], against)
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
         said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
@@ -293,12 +297,12 @@ def _limit(side: Side, variant: tuple[str, str], metric: MetricInfo, rule: Metri
     )
 
 
-def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str) -> str:
+def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str, against: str) -> str:
     unit = entry["unit"]
     head = f"{renderer}: {metric}"
     if entry["diff"] is None:
-        return f"{head} cannot be compared with {entry['baseline']}: {entry['reason']}"
-    text = f"{head} {_number(entry['diff'], unit, sign=True)} against {entry['baseline']}"
+        return f"{head} cannot be compared with {against}: {entry['reason']}"
+    text = f"{head} {_number(entry['diff'], unit, sign=True)} against {against}"
     if entry["ci95"] is None:
         return f"{text}: {entry['reason']}"
     low, high = (_number(b, unit, sign=True) for b in entry["ci95"])

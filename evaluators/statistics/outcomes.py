@@ -6,12 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from alpasim_plugin.run_folder.rows import Rollout
-from evaluators.metrics.outcomes import OUTCOMES, has_ended, outcomes_of, reached_end, told
+from evaluators.metrics.outcomes import CONTACT_SIDES, OUTCOMES, has_ended, outcomes_of, reached_end, told
 
 Times = Mapping[tuple[str, str, str, int], Mapping[str, float]]  # cell -> outcome -> seconds after the first frame
 LISTED = 20  # cells named per outcome in summary.json
 NAMED = 2  # in a sentence
-SIDES = ("collision_front", "collision_lateral", "collision_rear")
 
 
 def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], Times]:
@@ -28,7 +27,7 @@ def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], 
         )  # fmt: skip
         rows.append(row)
         found = {event["metric"]: float(event["t_s"]) for event in one.get("events") or [] if "t_s" in event}
-        contact = [found[side] for side in SIDES if side in found]
+        contact = [found[side] for side in CONTACT_SIDES if side in found]
         if contact:
             found |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
         times.setdefault(row.cell, found)

@@ -14,7 +14,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.viewer.cause import most_different, said
+from alpasim_plugin.viewer.cause import failed_at, most_different, said
 from scenarios.suite import expand
 from tests.runtime.grey_renderer import GREY
 from tests.runtime.test_runs import Announced
@@ -99,6 +99,9 @@ def test_a_seeded_fault_is_named(run: Path, policy: str, words: str, capsys: pyt
     page = Path(found["page"]).read_text()
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
     assert words in page.lower()
+    assert 'data-key="f"' in page
+    assert 'data-key="w"' not in page  # what was tried is not offered again
+    assert page.count('class="card scroll"') == page.count('class="card scroll" tabindex="0" role="region"')
 
 
 def test_the_run_writes_a_page_for_what_failed_and_links_it(run: Path) -> None:
@@ -111,6 +114,13 @@ def test_the_run_writes_a_page_for_what_failed_and_links_it(run: Path) -> None:
 def test_a_cell_outside_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["why", str(tmp_path / "clean/x/y/0")]) == 2
     assert "no run folder above it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("side", ["front", "lateral", "rear"])
+def test_a_contact_at_any_side_is_when_a_drive_failed(side: str) -> None:
+    events = [{"metric": "offroad", "t_us": 7}, {"metric": f"collision_{side}", "t_us": 5}, {"metric": "img_is_black", "t_us": 1}]
+    assert failed_at({"events": events}) == 5
+    assert failed_at({"events": events[2:]}) is None
 
 
 def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
