@@ -1,7 +1,7 @@
-"""How able a driver is, from which scenes it passes: the Rasch model of item response theory, with scenes weighed by drivers that are known.
+"""How able a driver is, from which scenes it passes: the Rasch model of item response theory, with scenes weighed by known drivers.
 
-A driver of ability a passes a scene of difficulty d with the chance 1 / (1 + exp(d - a)). Both are in logits; 0 is the mean difficulty of the
-scenes that are known. Difficulties have normal priors and come with a spread, which every chance is averaged over. Given difficulties, the
+A driver of ability a passes a scene of difficulty d with the chance 1 / (1 + exp(d - a)). Both are in logits; 0 is the mean difficulty of
+the known scenes. Difficulties have normal priors and come with a spread, which every chance is averaged over. Given difficulties, the
 number of scenes passed says all about an ability, and larger numbers are more likely the abler a driver is. So the interval holds those
 abilities under which the number is neither too small nor too large, each with a chance of 2.5 % at most: no prior on the driver, no large
 sample. Scenes discriminate alike: a slope a scene (2PL) would need dozens of known drivers.

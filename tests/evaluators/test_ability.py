@@ -71,7 +71,11 @@ def test_the_mode_is_where_no_small_step_is_likelier() -> None:
 
     def log_posterior(ability: np.ndarray, difficulty: np.ndarray) -> float:
         p = expit(ability[:, None] - difficulty)
-        return float(np.nansum(np.log(np.where(passed == 1, p, 1 - p)) * np.where(np.isnan(passed), 0, 1)) - (ability**2).sum() / 18 - (difficulty**2).sum() / 8)
+        return float(
+            np.nansum(np.log(np.where(passed == 1, p, 1 - p)) * np.where(np.isnan(passed), 0, 1))
+            - (ability**2).sum() / 18
+            - (difficulty**2).sum() / 8
+        )
 
     shift = max(np.linspace(-3, 3, 6001), key=lambda s: log_posterior(found.ability + s, found.difficulty + s))
     best = log_posterior(found.ability + shift, found.difficulty + shift)
