@@ -14,7 +14,7 @@ from alpasim_plugin.core.lazy import lazy_names
 from alpasim_plugin.io import places
 
 if TYPE_CHECKING:
-    from alpasim_plugin.alpasim.server.one_policy import serve_policy
+    from alpasim_plugin.alpasim.server.driver_service import serve_policy
     from alpasim_plugin.notebook import open_run
     from alpasim_plugin.runtime.cell import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
@@ -64,6 +64,6 @@ __getattr__ = lazy_names(
         "make_renderer": ".runtime.cell",
         "open_run": ".notebook",
         "run_rollout": ".runtime.rollout",
-        "serve_policy": ".alpasim.server.one_policy",
+        "serve_policy": ".alpasim.server.driver_service",
     },
 )

@@ -8,7 +8,7 @@ from alpasim_plugin import __version__
 from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from alpasim_plugin.alpasim.server.one_policy import serve_policy
+    from alpasim_plugin.alpasim.server.driver_service import serve_policy
     from alpasim_plugin.core.errors import InputError, SimrunError
     from alpasim_plugin.core.types import (
         U8,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from scenarios.load import load_scenario
 
 HOMES = {
-    "alpasim_plugin.alpasim.server.one_policy": ["serve_policy"],
+    "alpasim_plugin.alpasim.server.driver_service": ["serve_policy"],
     "alpasim_plugin.core.errors": ["InputError", "SimrunError"],
     "alpasim_plugin.core.types": [
         "CameraSpec", "EgoState", "Frame", "MetricInfo", "MetricSeries", "Observation", "Plan", "RenderRequest", "RolloutLog", "Route",

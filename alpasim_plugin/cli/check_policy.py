@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
-from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, findings, outside_view, tolerances
+from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, Finding, findings, outside_view, resident_mib, tolerances
 from alpasim_plugin.cli.options import Json, Overrides
-from alpasim_plugin.core.errors import PolicyError
+from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.process.subprocesses import parts_print_to_stderr
 from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.rollout import run_rollout
+from evaluators import reduce_rollout, score
+from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
+from evaluators.statistics.ability import ability_of, calibrate, chances
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
+from scenarios.suite import LIBRARY, expand
 
 BROKEN = 1
+ATTEMPTS = 2  # at a scene in which the driver is lost
+KNOWN = LIBRARY / "suites" / "known_drivers.json"  # which shipped scenes known drivers passed; docs/scripts/known_drivers.py records it
 
 CHECK_POLICY_EPILOG = """
 Examples:
@@ -58,35 +68,151 @@ Examples:
 - `simrun check-driver 127.0.0.1:50052`
 
 - `simrun check-driver my-driver:6000 --scenario scenes/one.usdz --set 'cameras=[{width: 576, height: 320}]'`
+
+- `simrun check-driver 127.0.0.1:50052 --scenario suites/hard`
 """
 
 
 def check_driver(
     address: Annotated[str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")],
-    scenario: Annotated[str, Flag("What it drives through.")] = "smoke/curve",
+    scenario: Annotated[str, Flag("What it drives through: a scenario, or a suite for a score of its ability.")] = "smoke/curve",
     renderer: Annotated[str, Flag("Renderer of its frames.")] = "clean",
     overrides: Overrides = (),
     limit_ms: Annotated[float, Flag("Longest drive call; the challenge allows 100.", min=0.1)] = LIMIT_S * 1000,
     as_json: Json = False,
 ) -> None:
-    """Check a driver before it is submitted: a rollout in AlpaSim's order of calls, its times, its plans, and what it must tolerate.
+    """Check a driver before it is submitted: rollouts in AlpaSim's order of calls, its times, its plans, and what it must tolerate.
 
     Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
     """
-    scene = load_scenario(scenario, overrides=("timing.timeline=alpasim", *(overrides)))
-    policy, times, failed = AlpasimPolicy(scene, address), DriveTimes(), None
-    times.watch(policy.service)
-    try:
-        run_rollout(scene, make_renderer(renderer, scene), policy)
-    except PolicyError as error:
-        failed = error
-    warmup = scene.warmup_us // scene.rates.policy_us + 1
-    found = [*findings(times, failed, warmup, limit_ms / 1000), *tolerances(policy.service, scene.scene_id), *outside_view()]
+    times = DriveTimes()
+    drives: list[Drive] = []
+    policy: AlpasimPolicy | None = None
+    for ref in expand(scenario, ("timing.timeline=alpasim", *overrides)):
+        scene = load_scenario(ref.path, ref.seed, ref.overrides)
+        try:
+            made = AlpasimPolicy(scene, address)
+        except InfrastructureError as error:
+            if policy is None:
+                raise
+            drives.append(Drive(scene.scene_id, 0, lost=1, failed=error))
+            break
+        if policy is not None:
+            policy.service.close()
+        policy = made
+        drives.append(rehearse(scene, policy, renderer, times))
+    assert policy is not None, "a scenario stands for one scene at least"
+    failed = next((one.failed for one in drives if one.failed is not None), None)
+    found = [*findings(times, failed, sum(one.warmup for one in drives), limit_ms / 1000), *over_scenes(drives)]
+    found += [*tolerances(policy.service, scene.scene_id), *outside_view()]
+    changed = [key for key in overrides if not key.startswith("cameras")]
+    other = f"behind {renderer}" if renderer != "clean" else f"with {changed[0]}" if changed else ""
+    ability = ability_over(drives, other)
     worst = 1 if any(one.result == "failed" for one in found) else 0
     if as_json:
-        print(json.dumps({"driver": policy.facts()["driver"], "checks": [one.__dict__ for one in found], "exit_code": worst}))
+        facts = {"driver": policy.facts()["driver"], "checks": [one.__dict__ for one in found], "ability": ability}
+        print(json.dumps({**facts, "scenes": [one.facts() for one in drives], "exit_code": worst}))
     else:
         print(f"driver  {policy.facts()['driver']}")
         for one in found:
             print(f"{one.result:7} {one.name}: {one.text}")
+        print(f"ability {ability['text']}")
     raise typer.Exit(worst)
+
+
+@dataclass
+class Drive:
+    """A scene of the rehearsal.
+
+    Attributes:
+        scene: Its id.
+        warmup: Queries in which empty plans are accepted.
+        outcomes: How it ended, by name; None where the driver was lost at every attempt.
+        lost: Attempts in which the connection was lost.
+        failed: What ended it early.
+        resident_mib: Memory of the driver afterwards, where it can be seen.
+    """
+
+    scene: str
+    warmup: int
+    outcomes: tuple[str, ...] | None = None
+    lost: int = 0
+    failed: SimrunError | None = None
+    resident_mib: float | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Return what JSON says of it."""
+        ended = None if self.outcomes is None else in_words(self.outcomes)
+        return {"scene": self.scene, "ended": ended, "lost": self.lost, "resident_mib": self.resident_mib}
+
+
+def rehearse(scene: Scenario, policy: AlpasimPolicy, renderer: str, times: DriveTimes) -> Drive:
+    """Drive a scene and name its outcomes; where the driver is lost, wait until it is there again and begin anew."""
+    out = Drive(scene.scene_id, scene.warmup_us // scene.rates.policy_us + 1)
+    times.watch(policy.service)
+    for _ in range(ATTEMPTS):
+        try:
+            log = run_rollout(scene, make_renderer(renderer, scene), policy).log()
+            values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
+            out.outcomes = tuple(name for name in OUTCOMES if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5)
+            out.failed = None
+        except PolicyError as error:
+            out.outcomes, out.failed = (POLICY_FAULT,), error
+        except InfrastructureError as error:
+            out.lost, out.failed = out.lost + 1, error
+            policy.forget_session()
+        if out.failed is None or out.outcomes is not None or not _is_back(policy):
+            break
+    out.resident_mib = resident_mib(policy.service.target)
+    return out
+
+
+def _is_back(policy: AlpasimPolicy) -> bool:
+    try:
+        policy.service.wait_ready()
+    except InfrastructureError:
+        return False
+    return True
+
+
+def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
+    """Return what the scenes show together: lost connections, and the driver's memory."""
+    lost = sum(one.lost for one in drives)
+    text = f"{lost} lost connections in {len(drives)} scenes; {sum(one.outcomes is None for one in drives)} scenes without an outcome"
+    found = [Finding("the connection lasts", "failed" if lost else "passed", text)]
+    seen = [one.resident_mib for one in drives if one.resident_mib is not None]
+    if len(seen) > 1:
+        text = f"{seen[0]:.0f} MiB after the first scene, {max(seen):.0f} at most, {seen[-1]:.0f} after the last; without children and GPU"
+        found.append(Finding("memory of the driver", "noted", text))
+    return found
+
+
+def ability_over(drives: Sequence[Drive], other: str = "") -> dict[str, Any]:
+    """Return the ability of the driver on the scale of the known ones, with its interval, in numbers and in words.
+
+    Args:
+        drives: What it drove.
+        other: What makes the scenes others than the known drivers drove, and their difficulties unknown.
+    """
+    known = json.loads(KNOWN.read_text())["passed"]
+    scenes, names = list(known), sorted({driver for ends in known.values() for driver in ends})
+    scale = calibrate(np.array([[known[scene].get(name, np.nan) for scene in scenes] for name in names], dtype=np.float64))
+    drove = [(scenes.index(one.scene), not one.outcomes) for one in drives if one.outcomes is not None and one.scene in known]
+    out: dict[str, Any] = {"n_scenes": len(drove), "n_passed": sum(ok for _, ok in drove), "estimate": None, "ci95": [None, None]}
+    out["known"] = {name: round(float(value), 2) for name, value in zip(names, scale.ability, strict=True)}
+    if other or not drove:
+        return {**out, "text": f"no score: no known driver drove these scenes {other}".rstrip()}
+    at = [index for index, _ in drove]
+    one = ability_of(out["n_passed"], scale.difficulty[at], scale.spread[at])
+    out |= {"estimate": one.estimate, "ci95": [one.low, one.high], "reason": one.reason}
+    share = [None if a is None else float(chances(a, scale.difficulty, scale.spread).mean()) for a in (one.estimate, one.low, one.high)]
+    out |= {"expected_share": share[0], "expected_share_ci95": share[1:], "n_known_scenes": len(scenes)}
+    if one.estimate is None:
+        side, bound, part = ("above", one.low, share[1]) if one.low is not None else ("below", one.high, share[2])
+        text = f"no score, {one.reason}; {side} {bound:+.2f} logits with 95 %, that is {part:.0%} of all {len(scenes)} known scenes"
+    else:
+        text = f"{one.estimate:+.2f} logits [{one.low:+.2f}, {one.high:+.2f}]: passes {out['n_passed']} of {len(drove)} known scenes, "
+        text += f"would pass {share[0]:.0%} [{share[1]:.0%}, {share[2]:.0%}] of all {len(scenes)}"
+    others = ", ".join(f"{name} {value:+.2f}" for name, value in out["known"].items())
+    left = len(drives) - len(drove)
+    return {**out, "text": text + (f"; {left} scenes without a known difficulty or an outcome" if left else "") + f" ({others})"}

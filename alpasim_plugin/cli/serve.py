@@ -11,9 +11,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
-from alpasim_plugin.alpasim.server.driver_service import DriverService
+from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
-from alpasim_plugin.alpasim.server.one_policy import ADDRESS
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.types import Scenario

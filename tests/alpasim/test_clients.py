@@ -280,7 +280,11 @@ def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
 ) -> None:
     timing = ["--set", "timing.duration_us=1900000", "--limit-ms", "60000", "--json"]
     assert run_command(["check-driver", driver[1], "--scenario", scene, *timing]) == 0
-    good = {one["name"]: one["result"] for one in json.loads(capsys.readouterr().out)["checks"]}
+    told = json.loads(capsys.readouterr().out)
+    good = {one["name"]: one["result"] for one in told["checks"]}
+    assert told["ability"]["text"] == "no score: no known driver drove these scenes with timing.duration_us=1900000"
+    assert [(one["ended"], one["lost"]) for one in told["scenes"]] == [("no event", 0)]
+    assert told["scenes"][0]["resident_mib"] > 10  # the service is in this process
     assert set(good.values()) == {"passed", "noted"}
     assert good["samples for minADE"] == "passed"
     late = egodriver_pb2.DriveResponse()

@@ -17,10 +17,9 @@ import pytest
 from alpasim_plugin.alpasim.server import gate
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.caches import SceneCache
-from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService
+from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService, _unknown_scene
 from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
-from alpasim_plugin.alpasim.server.one_policy import _unknown_scene
 from alpasim_plugin.alpasim.server.status import CallTime, Late
 from alpasim_plugin.alpasim.server.views import read_lens, read_view, straight_of
 from alpasim_plugin.core.errors import InputError

@@ -15,6 +15,8 @@ from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, assemble
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, RenderRequest
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
 from alpasim_plugin.renderers.gaussian import CleanRenderer
@@ -78,6 +80,31 @@ def test_a_moved_object_and_another_lens_are_seen(served: tuple[Any, Assembled])
     a, b = (decode_image(x)[centre].astype(int) for x in (before, bent))
     assert np.abs(a - b).mean() < 6
     assert before != bent
+
+
+def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path: Path) -> None:
+    """A PLY file replaces what the scenario builds; a car of the request is drawn in it as Gaussians, where the request puts it."""
+    ground = np.stack(np.meshgrid(np.linspace(-20, 120, 120), np.linspace(-20, 20, 40), [-0.05]), axis=-1).reshape(-1, 3)
+    n = len(ground)
+    cloud = GaussianCloud(ground, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), 0.7), np.full(n, 0.99), np.full((n, 1, 3), -1.0))
+    write_ply(tmp_path / "own.ply", cloud)
+    overrides = [f"background.file={tmp_path / 'own.ply'}"]
+    made = assemble(Settings(renderer="clean", scenes=[SCENE], overrides=overrides, threads=1))
+    shown = []
+    with hosted({"SensorsimService": made.service}) as host, channel_to(host) as channel:
+        stub = Stub(channel, "SensorsimService")
+        (ident,) = stub.get_available_scenes(common_pb2.Empty()).scene_ids
+        for aside_m, up_m in ((0.0, -100.0), (0.0, 0.0), (2.0, 0.0)):
+            asked = ask()
+            asked.scene_id = ident
+            for o in asked.dynamic_objects:
+                o.pose_pair.end_pose.vec.y += aside_m
+                o.pose_pair.end_pose.vec.z += up_m
+            shown.append(decode_image(answers(stub, [asked])[0]).astype(int))
+    hidden, ahead, left = shown
+    places = [np.argwhere(np.abs(one - hidden).max(axis=2) > 24)[:, 1].mean() for one in (ahead, left)]
+    assert abs(places[0] - W / 2) < 3
+    assert places[1] < places[0] - 2
 
 
 def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> None:

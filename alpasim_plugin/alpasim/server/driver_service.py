@@ -2,12 +2,20 @@
 
 Submissions may come in any order and from several threads. A query before every camera has a frame, or before any motion, is answered with
 an empty plan, which AlpaSim accepts in its warm-up.
+
+`serve_policy` serves a policy in a Python environment of its own, which `simrun --policy "exec:..."` starts and drives. Of this project
+only light modules are imported here, and of other packages numpy, grpc, protobuf and OpenCV: the environment needs neither torch nor the
+rest. A test holds it to that.
 """
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import os
 import threading
 import time
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -16,19 +24,20 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin import __version__
-from alpasim_plugin.alpasim.server.hosting import SESSIONS, Sessions
+from alpasim_plugin.alpasim.server.hosting import SESSIONS, Host, Sessions
 from alpasim_plugin.alpasim.server.status import answering
 from alpasim_plugin.alpasim.server.views import MAX_TIME_US, Straight, straight_of
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
-from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
+from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import increasing_times, read_poses, read_transform, wire_trajectory
-from alpasim_plugin.plugins.interfaces import Policy
+from alpasim_plugin.plugins.interfaces import Policy, complete
 from alpasim_plugin.wire import api_version, common_pb2, egodriver_pb2, sensorsim_pb2
 
 DOING = "driving for AlpaSim"
+ADDRESS = "SIMRUN_POLICY_ADDRESS"
 ROUTE_POINTS = 20
 MOVING_MPS = 0.3  # AlpaSim sends zero speeds until it hands over; faster motion than this is believed against them
 SPEED_WINDOW_US = 200_000
@@ -300,3 +309,59 @@ def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.Avail
             raise InputError(DOING, f"camera {camera.logical_id!r}", error.found, do_this) from error
         read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
     return {camera.logical_id: camera for camera in listed}
+
+
+def serve_policy(factory: Callable[..., Any], address: str | None = None) -> None:
+    """Serve a policy as AlpaSim's EgodriverService until the process is ended.
+
+    Args:
+        factory: The policy's class, or a function that makes one; called for every rollout, with the scenario if it has a parameter of that
+            name. Of the scenario only the cameras are true. What is costly to load belongs outside of it.
+        address: ``HOST:PORT`` or ``unix:PATH``; by default what the environment variable ``SIMRUN_POLICY_ADDRESS`` says.
+
+    Raises:
+        InputError: There is no address.
+        InfrastructureError: The address cannot be had.
+
+    Example:
+        >>> serve_policy(Mine)  # doctest: +SKIP
+    """
+    place = address or os.environ.get(ADDRESS, "")
+    if not place:
+        do_this = f"start the script by simrun --policy 'exec:python SCRIPT.py', or set {ADDRESS}=127.0.0.1:6000"
+        raise InputError("serving a policy", f"environment variable {ADDRESS}", "it is not set", do_this)
+    takes_scenario = "scenario" in inspect.signature(factory).parameters
+    name = getattr(factory, "__name__", type(factory).__name__)
+
+    def make(scenario: Scenario) -> Policy:
+        made: Policy = complete(factory(scenario=scenario) if takes_scenario else factory(), Policy, f"policy {name!r}")
+        return made
+
+    service = _Serving(name, _file_digest(factory), make, _unknown_scene)
+    with Host({"EgodriverService": service}, place, every=service.sessions.expire) as host:
+        host.wait()
+
+
+class _Serving(DriverService):
+    """The service, which prints the tracebacks of its policy: they end up in the run's output."""
+
+    def failed(self, call: str, code: Any, text: str, error: Exception) -> None:
+        super().failed(call, code, text, error)
+        traceback.print_exception(error)
+
+
+def _unknown_scene(scene_id: str) -> Scenario:
+    standing = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    return blank_scenario(scene_id, standing)
+
+
+def _file_digest(factory: Callable[..., Any]) -> str | None:
+    """Return the SHA-256 of the file that defines the policy, for `get_version`."""
+    try:
+        file = inspect.getsourcefile(factory)
+    except (TypeError, OSError):  # no Python source: a built-in, or typed after -c
+        return None
+    if file is None or not os.path.isfile(file):
+        return None
+    with open(file, "rb") as source:
+        return hashlib.file_digest(source, "sha256").hexdigest()
