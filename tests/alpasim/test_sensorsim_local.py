@@ -130,7 +130,11 @@ def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> N
         (lambda stub: stub.render_rgb(changed(scene_id="other")), "NOT_FOUND", "none of the 1 known"),
         (lambda stub: stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id="other")), "NOT_FOUND", "none of the 1 known"),
         (lambda stub: stub.render_rgb(changed(track="ghost")), "INVALID_ARGUMENT", "'ghost', not in the scene"),
-        (lambda stub: stub.render_lidar(sensorsim_pb2.LidarRenderRequest()), "UNIMPLEMENTED", "needs an --upstream"),
+        (
+            lambda stub: stub.render_lidar(sensorsim_pb2.LidarRenderRequest(lidar_config={"lidar_type": 7})),
+            "UNIMPLEMENTED",
+            "type 7 needs an --upstream",
+        ),
     ],
 )
 def test_what_is_not_here_is_refused_with_a_reason(served: tuple[Any, Assembled], call: Any, code: str, found: str) -> None:
