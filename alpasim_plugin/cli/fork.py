@@ -149,5 +149,5 @@ def why(
         return
     print(f"outcome  {cause.outcome}")
     for how, text in cause.sentences:
-        print(f"{how:9}{text}")
+        print(f"{how:8} {text}")
     print(f"page     {shlex.quote(str(page))}")

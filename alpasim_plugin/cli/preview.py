@@ -59,7 +59,7 @@ class Preview:
     text: tuple[str, ...]
 
 
-def draw_preview(scenario: Scenario, path: Path, renderer: str = "clean") -> Preview:
+def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) -> Preview:
     """Draw a scenario into a PNG, or into an HTML page that holds it.
 
     The drive and all road users are drawn as recorded or scripted; reactive ones go other ways once a policy drives.
@@ -67,7 +67,7 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str = "clean") -> Pre
     Args:
         scenario: What is drawn.
         path: ``.png`` or ``.html``.
-        renderer: What the camera frames are rendered by.
+        renderer: What the camera frames are rendered by; None: clean, or 3dgs for an imported drive, of which nothing was built.
 
     Raises:
         InputError: Another suffix, or no such renderer.
@@ -79,7 +79,7 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str = "clean") -> Pre
     times = [int(t) for t in np.linspace(scenario.start_us, scenario.end_us, MOMENTS)]
     there = [actor for actor in scenario.actors if actor.track.t_us[0] <= scenario.end_us and actor.track.t_us[-1] >= scenario.start_us]
     facts = _facts(scenario, there)
-    png = _figure(scenario, there, times, _camera_frames(scenario, times, renderer), facts)
+    png = _figure(scenario, there, times, _camera_frames(scenario, times, renderer or ("3dgs" if scenario.model else "clean")), facts)
     write_bytes(path, png if path.suffix == ".png" else _page(scenario, png, facts))
     return Preview(tuple(round((t - times[0]) * 1e-6, 3) for t in times), len(there), facts)
 
@@ -235,7 +235,7 @@ def preview(
     scenario: Annotated[str, Positional("Scenario YAML, a shipped name, or a recorded log.")],
     out: Annotated[Path | None, Flag("PNG or HTML; by default SCENE.png here.", also="-o")] = None,
     seed: Annotated[int | None, Flag("Scene seed; by default the file's.", min=0)] = None,
-    renderer: Annotated[str, Flag("What renders the camera frames.")] = "clean",
+    renderer: Annotated[str | None, Flag("What renders the camera frames; clean, or 3dgs for an imported drive.")] = None,
     overrides: Overrides = (),
     overwrite: Overwrite = False,
     as_json: Json = False,

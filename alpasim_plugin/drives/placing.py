@@ -140,7 +140,7 @@ def _scale(drive: SourceDrive, strip: GroundStrip | None, camera_height_m: float
     if drive.metric is not None:
         return 1.0, f"scale from {drive.metric}"
     wanted = camera_height_m or CAMERA_HEIGHT_M
-    how = "as given" if camera_height_m else "assumed; give --camera-height if you know it"
+    how = "as given" if camera_height_m else "assumed; `simrun import drive` takes --camera-height"
     if strip is not None:
         return wanted / strip.height, f"scale from the camera's height above the ground, {wanted:g} m ({how})"
     reach = float(np.linalg.norm(drive.path - drive.path.mean(axis=0), axis=1).max())

@@ -68,6 +68,9 @@ def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path: Path) -> None:
     quality = import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses", turn=turn), tmp_path / "out")
     assert_drives(tmp_path / "out")
     assert any("no photographs" in note for note in quality["notes"])
+    assert any("assumed; `simrun import drive` takes --camera-height" in note for note in quality["notes"])
+    assert run_command(["preview", str(tmp_path / "out" / "scenario.yaml"), "--out", str(tmp_path / "street.png")]) == 0
+    assert (tmp_path / "street.png").stat().st_size > 10_000
     assert quality["photographs"] == {}
     assert load_scenario(tmp_path / "out/scenario.yaml").recording == ()
     assert quality["coverage"][0]["share"] > 0.5
