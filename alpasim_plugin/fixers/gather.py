@@ -105,28 +105,22 @@ def _gather_beside(references, render, mean4, mean2, each4, each2):
                     row[CHANNELS * x + 3] = holds
                 for i in range(len(row)):
                     mean[i] += row[i] * share
-                _put_runs_of_16(row, each4[b * count + k, i4], at4)
-                _put_runs_of_8(row, each2[b * count + k, i2], at2)
-            _put_runs_of_16(mean, mean4[b, i4], at4)
-            _put_runs_of_8(mean, mean2[b, i2], at2)
+                _put_runs(row, each4[b * count + k, i4], at4, CELL * CHANNELS)
+                _put_runs(row, each2[b * count + k, i2], at2, DETAIL * CHANNELS)
+            _put_runs(mean, mean4[b, i4], at4, CELL * CHANNELS)
+            _put_runs(mean, mean2[b, i2], at2, DETAIL * CHANNELS)
 
 
-@njit(cache=True, nogil=True)
-def _put_runs_of_16(row, cells, at):
-    """Write a row of pixels into the row of cells of 4 x 4 that it crosses, from ``at`` on. A run is a vector."""
+@njit(cache=True, nogil=True, inline="always")
+def _put_runs(row, cells, at, run):
+    """Write a row of pixels into the row of cells that it crosses, ``run`` values into each, from ``at`` on.
+
+    It is inlined, so that ``run`` is a constant where it is called, and a run is a vector.
+    """
     for j in range(cells.shape[0]):
         cell = cells[j]
-        for i in range(CELL * CHANNELS):
-            cell[at + i] = row[CELL * CHANNELS * j + i]
-
-
-@njit(cache=True, nogil=True)
-def _put_runs_of_8(row, cells, at):
-    """Write a row of pixels into the row of cells of 2 x 2 that it crosses, from ``at`` on."""
-    for j in range(cells.shape[0]):
-        cell = cells[j]
-        for i in range(DETAIL * CHANNELS):
-            cell[at + i] = row[DETAIL * CHANNELS * j + i]
+        for i in range(run):
+            cell[at + i] = row[run * j + i]
 
 
 @torch.library.custom_op("simrun::likeness", mutates_args=(), device_types="cpu")

@@ -11,20 +11,17 @@ flat, divided by that of the truth.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from trust_calibration import words_of
+from trust_calibration import asked_for, words_of
 
 from alpasim_plugin.core.types import F64, U8, Bool
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.warp import on_boxes, plain_points
 from alpasim_plugin.lab.bench.quality import QualityClip, fixer_input
-from alpasim_plugin.lab.bench.quality_run import quality_clip
-from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.plugins.parts.resolve import split_settings
 
@@ -80,14 +77,7 @@ def restlessness(video: U8, where: Bool) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data")
-    parser.add_argument("--split", default="val")
-    parser.add_argument("--fixer", default="onefixer[references=0],onefixer")
-    parser.add_argument("--frames", type=int, default=31)
-    asked = parser.parse_args()
-    names = asked.fixer.split(",")
-    clips = [quality_clip(one).first(asked.frames) for one in PairDataset(asked.data, asked.split).sequences]
+    names, clips = asked_for(__doc__, "onefixer[references=0],onefixer")
     shares = np.zeros((len(clips), len(CLASSES)))
     error = np.full((len(clips), 1 + len(names), len(CLASSES)), np.nan)
     speckle = np.zeros((len(clips), 1 + len(names)))

@@ -9,19 +9,17 @@ pixels a frame that no paint of the truth explains; their share of all painted p
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 from gain_by_class import videos
+from trust_calibration import asked_for
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import U8, HeightField
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
 from alpasim_plugin.lab.bench.quality import QualityClip
-from alpasim_plugin.lab.bench.quality_run import quality_clip
-from alpasim_plugin.lab.training.pair_store import PairDataset
 
 
 def roads_of(clip: QualityClip) -> list[Road]:
@@ -50,14 +48,7 @@ def counts(video: U8, truth: U8, roads: list[Road]) -> PaintCounts:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data")
-    parser.add_argument("--split", default="val")
-    parser.add_argument("--fixer", default="onefixer[references=0],onefixer")
-    parser.add_argument("--frames", type=int, default=31)
-    asked = parser.parse_args()
-    names = asked.fixer.split(",")
-    clips = [quality_clip(one).first(asked.frames) for one in PairDataset(asked.data, asked.split).sequences]
+    names, clips = asked_for(__doc__, "onefixer[references=0],onefixer")
     roads = [roads_of(clip) for clip in clips]
     frames = sum(len(clip.t_us) for clip in clips)
     rows: dict[tuple[str, str], PaintCounts] = {}

@@ -39,7 +39,7 @@ if __name__ == "__main__":
     parser.add_argument("out", type=Path)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--policy", default=",".join(POLICIES))
-    asked = parser.parse_args()
+    asked = parser.parse_intermixed_args()  # scenes may stand after an option
     known = json.loads(asked.out.read_text()) if asked.out.exists() else {"passed": {}}
     for policy in asked.policy.split(","):
         for scene in asked.scenes or [f"{Path(ref.path).parent.name}/{Path(ref.path).stem}" for ref in expand("suites/all")]:

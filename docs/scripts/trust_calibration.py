@@ -21,6 +21,7 @@ from alpasim_plugin.lab.bench.quality import QualityClip, fixer_input
 from alpasim_plugin.lab.bench.quality_run import quality_clip
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.plugins.parts import build, resolve
+from alpasim_plugin.plugins.parts.resolve import split_names
 from evaluators.statistics.intervals import t_interval
 
 GUESSED, RECORDED = (0, 1 / 16, 1 / 8, 1 / 4, 1), (0, 1 / 8, 1 / 2, 7 / 8, 1)  # borders of the classes
@@ -55,15 +56,22 @@ def classes(values: F64, borders: tuple[float, ...]) -> list[np.ndarray]:
     return [place == k for k in range(len(borders) - 1)]
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def asked_for(description: str | None, fixers: str) -> tuple[list[str], list[QualityClip]]:
+    """Return the fixers and the first frames of the clips that the command line names."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data")
     parser.add_argument("--split", default="val")
-    parser.add_argument("--fixer", default="onefixer")
+    parser.add_argument("--fixer", default=fixers)
     parser.add_argument("--frames", type=int, default=31)
     asked = parser.parse_args()
-    found = [cells_of(quality_clip(one).first(asked.frames), asked.fixer) for one in PairDataset(asked.data, asked.split).sequences]
+    clips = [quality_clip(one).first(asked.frames) for one in PairDataset(asked.data, asked.split).sequences]
+    return split_names(asked.fixer), clips
+
+
+def main() -> None:
+    """Measure and print."""
+    (name,), clips = asked_for(__doc__, "onefixer")
+    found = [cells_of(clip, name) for clip in clips]
     for title, column, borders in (("made up", 1, GUESSED), ("recorded", 0, RECORDED)):
         print(f"| {title} | share of cells | error before | error after |\n|---|---:|---:|---:|")
         for k, (low, high) in enumerate(pairwise(borders)):
