@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 
+BLOCK = re.compile(r"(encode|decode|middle)\w*\.\d+\.")  # a residual block of a stage
 DOING = "training a per-frame generator"
 
 
@@ -101,10 +103,12 @@ def train_per_frame(
 
 
 def initial_generator(run: PixelRun) -> PixelGenerator:
-    """Return the network that a run begins with.
+    """Return the network that a run begins with: a bundle may lack the blending head or have fewer residual blocks than the settings.
+
+    What it lacks is untrained; a block that it lacks leaves its input as it is.
 
     Raises:
-        InputError: A bundle of another kind, or of other sizes than the settings.
+        InputError: A bundle of another kind, or of other widths than the settings.
     """
     net = PixelGenerator.random(sizes_of(run.settings), derive_seed("training", run.seed, "pixel.weights"))
     if run.init is None or _is_checkpoint(run.init):
@@ -113,12 +117,13 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
     if tensors is None:
         raise InputError(DOING, str(run.init), "no part generator.*", "give a checkpoint or a bundle of 'simrun train per-frame'")
     own = net.state_dict()
-    wrong = sorted(key for key in tensors.keys() | own.keys() if not key.startswith("blend.") and not _fits(tensors.get(key), own.get(key)))
-    wrong += sorted(key for key in tensors if key.startswith("blend.") and not _fits(tensors[key], own.get(key)))
+    lacking = {key for key in own.keys() - tensors.keys() if key.startswith("blend.") or BLOCK.match(key)}
+    wrong = sorted(key for key in (tensors.keys() | own.keys()) - lacking if not _fits(tensors.get(key), own.get(key)))
     if wrong:
         found = f"{len(wrong)} tensors of other sizes than {net.facts}, such as {wrong[0]}"
-        raise InputError(DOING, str(run.init), found, "choose the fixer of the same sizes")
-    net.load_state_dict({**own, **tensors})  # a bundle that reads no references gets an untrained blending head
+        raise InputError(DOING, str(run.init), found, "choose the fixer of the same widths")
+    identity = {key: torch.zeros_like(own[key]) for key in lacking if key.endswith("second.weight")}
+    net.load_state_dict({**own, **tensors, **identity})
     return net
 
 
