@@ -8,15 +8,18 @@ what the generator draws now. Elsewhere an opaque render is better evidence than
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.image_metrics import is_black
-from alpasim_plugin.core.types import U8
+from alpasim_plugin.core.types import F32, U8
 
+Ramped = TypeVar("Ramped", Tensor, F32)
 NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"
 LIMIT = 1.5  # a quarter of the range from black to white beyond either end
 SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
@@ -25,6 +28,7 @@ CELL = 8  # pixels of the side of a cell; changes are judged by cells
 REACH = 2  # cells around, where the map or the last output may support a change
 OPAQUE = (0.9, 0.98)  # opacity of a cell: below the first the generator is free, above the second the render is fully trusted
 LARGE = (0.3, 0.5)  # mean change of a cell, of a range of 2: below the first it is never touched, above the second not believed
+AROUND = 2 * REACH + 1
 MAPPED = 0.02  # share of a cell's range that drawn map covers
 
 
@@ -81,18 +85,28 @@ def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     return events
 
 
-def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor) -> Tensor | None:
-    """Return the weight of the render in the picture; None where it is 0 everywhere.
+def keep_render(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor, recorded: Tensor) -> Tensor | None:
+    """Put the render back where the change is not believable; None where nothing is put back.
 
     Args:
-        out: ``(B, H, W, 3)`` generated frame.
+        out: ``(B, H, W, 3)`` generated frame, in the range from -1 to 1 or a little beyond.
         render: Like ``out``.
         opacity: ``(B, H, W, 1)``.
         sdmap: Like ``out``; black where it shows nothing.
         before: The last output, like ``out``.
+        recorded: ``(B, H, W, 1)`` share of the references, which are evidence of their own: what they show stays.
+    """
+    if out.device.type == "cpu":
+        kept = [_keep_one(*images) for images in zip(*(x.numpy() for x in (out, render, opacity, sdmap, before, recorded)), strict=True)]
+        return None if all(one is None for one in kept) else torch.stack([o if k is None else k for o, k in zip(out, kept, strict=True)])
+    share = render_share(out, render, opacity, sdmap, before)
+    return None if share is None else torch.lerp(out, render, share * (1 - recorded))
 
-    Returns:
-        ``(B, H, W, 1)``, 0 nearly everywhere.
+
+def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor) -> Tensor | None:
+    """Return the weight of the render in the picture ``(B, H, W, 1)``, 0 nearly everywhere; None where it is 0 everywhere.
+
+    It is what `keep_render` does on other devices than processors, and the reference of what it does there; arguments as there.
     """
     change = _cells((out - render).abs_()).mean(1, keepdim=True)
     if float(change.amax()) <= LARGE[0]:
@@ -100,9 +114,9 @@ def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, be
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
     if not trusted.any():
         return None
-    mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, 2 * REACH + 1, 1, REACH) > MAPPED
+    mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, AROUND, 1, REACH) > MAPPED
     now, past = _cells(out), _cells(before)
-    low, high = (-F.max_pool2d(-past, 2 * REACH + 1, 1, REACH), F.max_pool2d(past, 2 * REACH + 1, 1, REACH))
+    low, high = -F.max_pool2d(-past, AROUND, 1, REACH), F.max_pool2d(past, AROUND, 1, REACH)
     beyond = torch.relu(now - high).amax(1, keepdim=True) + torch.relu(low - now).amax(1, keepdim=True)
     unseen = _ramp(beyond, *(limit / 2 for limit in LARGE))
     share = trusted * unseen * ~mapped
@@ -116,5 +130,29 @@ def _cells(x: Tensor) -> Tensor:
     return rows.view(b, h // CELL, w // CELL, CELL, c).mean(3).permute(0, 3, 1, 2)
 
 
-def _ramp(x: Tensor, low: float, high: float) -> Tensor:
-    return ((x - low) / (high - low)).clamp(0, 1)
+def _keep_one(out: F32, render: F32, opacity: F32, sdmap: F32, before: F32, recorded: F32) -> Tensor | None:
+    """Do what `keep_render` does for one image, `render_share` by OpenCV, which pools images whose channels come last six times as fast."""
+    height, width, _ = out.shape
+    size, around = (width // CELL, height // CELL), np.ones((AROUND, AROUND), np.uint8)
+
+    def means(image: F32) -> F32:
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+    change = means(cv2.absdiff(out, render)).mean(axis=-1)
+    if float(change.max()) <= LARGE[0]:
+        return None
+    share = _ramp(means(opacity), *OPAQUE) * _ramp(change, *LARGE)
+    share[cv2.dilate((means(sdmap).mean(axis=-1) + 1) / 2, around) > MAPPED] = 0
+    if not share.any():
+        return None
+    now, past = means(out), means(before)
+    above, below = now - cv2.dilate(past, around), cv2.erode(past, around) - now
+    share *= _ramp(np.maximum(above.max(axis=-1), 0) + np.maximum(below.max(axis=-1), 0), *(limit / 2 for limit in LARGE))
+    if not share.any():
+        return None
+    weight = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))[..., None] * (1 - recorded)
+    return torch.from_numpy(out + weight * (render - out))
+
+
+def _ramp(x: Ramped, low: float, high: float) -> Ramped:
+    return ((x - low) / (high - low)).clip(0, 1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, I64, U8, Frame
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.guard import render_share
+from alpasim_plugin.fixers.guard import keep_render
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -66,11 +66,9 @@ def fix_frame(
         t = level.sigma
         out, after = generator.net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t), inputs.references)
     if settings.keep_render:
-        share = render_share(out, render, inputs.opacity, inputs.sdmap, state.output)
-        if share is not None:
-            share = share * (1 - after.recorded)  # a recorded frame is evidence of its own
-            out = torch.lerp(out, render, share)
-            after = after._replace(output=out.clamp(-1, 1))
+        kept = keep_render(out, render, inputs.opacity, inputs.sdmap, state.output, after.recorded)
+        if kept is not None:
+            out, after = kept, after._replace(output=kept.clamp(-1, 1))
     return out, after
 
 
