@@ -115,7 +115,7 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
 def placed_boxes(actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> tuple[list[str], F64, F64]:
     """Return names, ``T_box_world (A, 4, 4)`` and sizes ``(A, 3)`` of the actors that have a box."""
     now = [name for name in sorted(actors) if name in boxes]
-    T_box_world = np.array([inverse(actors[name]) for name in now]).reshape(-1, 4, 4)
+    T_box_world = inverse(np.array([actors[name] for name in now]).reshape(-1, 4, 4))
     return now, T_box_world, np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
 
 

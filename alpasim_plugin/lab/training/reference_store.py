@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,10 +65,11 @@ class SequenceReferences:
         """Yield the references of the first frames, at most ``count`` each, as the closed loop gives them."""
         index, sizes, whole = self.index(), self.sizes(), slice(None)
         last: Sequence[int] = ()
+        picture = lru_cache(count + 1)(self.picture)  # most are those of the frame before, as in a drive
         for i in range(frames):
             last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
             target = self.target(i, self.K, whole, whole)
-            yield carry([self.picture(j) for j in last], target, self.T_world_rig(i), sizes)
+            yield carry([picture(j) for j in last], target, self.T_world_rig(i), sizes)
 
     def target(self, i: int, K: F64, rows: slice, columns: slice) -> WarpTarget:
         """Return a crop of frame ``i`` as a view; ``K`` is that of the crop."""
@@ -126,13 +128,13 @@ def open_references(sequence: PairSequence) -> SequenceReferences | None:
     if not (folder / FOLDER).is_dir():
         return None
     names = ("depth", "actors", "boxes", *(f"{FOLDER}/{name}" for name in ("rgb", "depth", "T_world_camera", "t_us", "actors")))
-    opened = [open_npy(folder / f"{name}.npy", READING, "run 'simrun train pairs' again") for name in names]
+    opened = [np.asarray(open_npy(folder / f"{name}.npy", READING, "run 'simrun train pairs' again")) for name in names]  # plain: faster
     clip = sequence.clip
     if len(opened[0]) < len(clip) or len({len(array) for array in opened[3:]}) != 1:
         found = f"{len(opened[0])} depths of {len(clip)} frames, recorded frames {[len(array) for array in opened[3:]]}"
         raise InputError(READING, str(folder / FOLDER), found, "remove the folder and run 'simrun train pairs' again")
     K, T_rig_camera = (np.array(sequence.info["camera"][name], dtype=np.float64) for name in ("K", "T_rig_camera"))
-    return SequenceReferences(K, T_rig_camera, clip.T_world_camera, clip.t_us, *opened)
+    return SequenceReferences(K, T_rig_camera, np.asarray(clip.T_world_camera), clip.t_us, *opened)
 
 
 def _poses(frames: Sequence[Mapping[str, F64]], names: Sequence[str]) -> F64:
