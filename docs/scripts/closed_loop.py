@@ -7,7 +7,8 @@ and then ``python docs/scripts/headline.py``, which writes what README.md and do
 SCENES is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen ones; RUNS (default:
 runs/closed-loop) keeps the run folders, so a second call continues an interrupted first one. Behind a policy's name stand its number of
 seeds and its renderers, all four by default. Scenes are driven as long as they were drawn. With ``--seconds`` they are cut, which the
-headline then says, and a scene whose events need more is driven for as many seconds as it needs.
+headline then says, and a scene whose events need more is driven for as many seconds as it needs. A run that other code began would be
+driven again from its start; with ``--finished`` nothing is driven, and the tables are those of the runs as they stand.
 """
 
 from __future__ import annotations
@@ -36,14 +37,12 @@ EVENT = "offroad_or_collision_at_fault"
 SHOWN = ("collision_at_fault", "offroad", EVENT, "lateral_distance_m", "progress", "min_distance_to_obstacle_m")
 
 
-def drive(out: Path, arguments: list[str]) -> dict[str, Any]:
-    """Run simrun and return its summary; a verdict, whatever it is, is a result."""
+def drive(out: Path, arguments: list[str]) -> None:
+    """Run simrun; a verdict, whatever it is, is a result."""
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", *arguments, "--out", str(out)]
     code = subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode
     if code not in (0, *VERDICTS):
         sys.exit(f"exit code {code}; see {out}")
-    summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
-    return summary
 
 
 def paired_cell(entry: dict[str, Any] | None, rate: bool) -> str:
@@ -127,6 +126,7 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
     parser.add_argument("--policies", default="learned:5,lane-camera:5")
     parser.add_argument("--seconds", type=int, help="Cut the drives; whole by default.")
+    parser.add_argument("--finished", action="store_true", help="Drive nothing; read the runs as they stand.")
     given = parser.parse_args()
     scenes = [given.scenes / split / f"{name}.yaml" for split, frozen in check_scenes(given.scenes).items() for name in frozen.scenes]
     suite = given.runs / "suite.yaml"
@@ -142,8 +142,11 @@ def main() -> None:
         policy, seeds, renderers = words + ["", "5", "+".join(RENDERERS)][len(words) :]
         shown = renderers.split("+")
         options = ["--renderer", ",".join(shown), "--baseline", BASELINE, "--policy", policy, "--seeds", seeds]
-        summary = drive(given.runs / f"{policy}-{seeds}", [*options, "--images", "none", "--resume", str(suite)])
-        rows = pq.read_table(given.runs / f"{policy}-{seeds}" / "rollouts.parquet").to_pylist()
+        run = given.runs / f"{policy}-{seeds}"
+        if not given.finished:
+            drive(run, [*options, "--images", "none", "--resume", str(suite)])
+        summary = json.loads((run / "summary.json").read_text())
+        rows = pq.read_table(run / "rollouts.parquet").to_pylist()
         head = f"**{policy}**: {len(scenes)} scenes x {seeds} seeds"
         parts.append("\n\n".join((head, table(summary, shown), families(rows, shown), events(rows, shown))))
     page = DOCS / "experiments" / "fixer-closed-loop.md"
