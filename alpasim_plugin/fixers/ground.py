@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, warp
+from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
 
 I32 = npt.NDArray[np.int32]
 
@@ -29,20 +29,19 @@ HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind s
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
-def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> tuple[U8, ...]:
+def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64) -> tuple[U8, ...]:
     """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of every pixel.
 
     Args:
         pictures: Recorded frames as of `with_users`, nearest first; the first two are compared.
-        target: The view.
+        target: The view; where a ray meets the box of an actor, the render's depth counts.
         T_world_rig: ``(4, 4)`` of a rig near the view; the plane z = 0 of it is the ground.
-        boxes: Sizes of the actors; where a ray meets the box of one, the render's depth counts.
 
     Returns:
         For each picture ``(H, W, 4)`` uint8: see `warp`.
     """
-    by_depth = [warp(picture, target, boxes) for picture in pictures]
-    depth = ground_hypothesis(target, T_world_rig, boxes)
+    by_depth = [warp(picture, target) for picture in pictures]
+    depth = ground_hypothesis(target, T_world_rig)
     rows = np.flatnonzero(depth.any(axis=1))
     if not by_depth or not len(rows):
         return tuple(by_depth)
@@ -50,7 +49,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, box
     K = target.K.copy()
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
-    by_ground = [warp(_hidden_by_users(picture), view, boxes, FREE_SHARE) for picture in pictures]
+    by_ground = [warp(_hidden_by_users(picture), view, FREE_SHARE) for picture in pictures]
     ground = view.depth > 0
     if len(pictures) > 1:
         size = window_px(K)
@@ -67,7 +66,7 @@ def window_px(K: F64) -> int:
     return max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
 
 
-def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, Box]) -> F32:
+def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of the view may show it; elsewhere 0.
 
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
@@ -80,14 +79,15 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64, boxes: Mapping[str, 
     slope = down[0] * (np.arange(width) + 0.5) + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
     z = np.divide(-height_m, slope, out=np.zeros_like(slope), where=slope < 0)
     free = (target.depth <= 0) | (target.depth >= FREE_SHARE * z)
-    free &= (z > NEAREST_M) & (z < FARTHEST_M) & ~on_boxes((height, width), target.K, target.T_world_camera, target.actors, boxes)
+    free &= (z > NEAREST_M) & (z < FARTHEST_M) & ~on_boxes((height, width), target.placed.seen)
     return np.where(free, z, 0).astype(np.float32)
 
 
 def with_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
     """Return a recorded frame that knows which of its pixels show road users."""
     height, width = picture.depth.shape
-    users = on_boxes((height, width), picture.K, picture.T_world_camera, picture.actors, boxes)
+    placed = place_boxes((height, width), picture.K, picture.T_world_camera, picture.actors, boxes)
+    users = on_boxes((height, width), placed.seen)
     return replace(picture, users=users) if users.any() else picture
 
 

@@ -118,9 +118,9 @@ class ReferenceSession:
             top, end = max(band.rows.start - around, 0), min(band.rows.stop + around, len(frame.depth))
             K = request.camera.K.copy()
             K[1, 2] -= top
-            target = WarpTarget(K, band.T_world_camera, frame.depth[top:end], band.actors)
+            target = WarpTarget(K, band.T_world_camera, frame.depth[top:end], band.actors, self._boxes)
             own = slice(band.rows.start - top, band.rows.stop - top), band.columns
-            for whole, part in zip(out, carry(pictures, target, T_world_rig, self._boxes), strict=True):
+            for whole, part in zip(out, carry(pictures, target, T_world_rig), strict=True):
                 band.put(whole, part[own])
         return out
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -34,12 +35,19 @@ class WarpTarget:
         T_world_camera: ``(4, 4)``.
         depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as infinitely far.
         actors: ``T_world_box`` of the actors present.
+        boxes: Sizes of actors; one that has none counts as absent.
     """
 
     K: F64
     T_world_camera: F64
     depth: F32
     actors: Mapping[str, F64]
+    boxes: Mapping[str, Box]
+
+    @cached_property
+    def placed(self) -> PlacedBoxes:
+        """The boxes of the actors present, as the view sees them; found once for all recorded frames that are carried into it."""
+        return place_boxes(self.depth.shape, self.K, self.T_world_camera, self.actors, self.boxes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +75,7 @@ class Lookup(NamedTuple):
         sizes: ``(A, 3)`` length, width and height, metres.
         free_share: A recorded surface that is at least this share of a point's distance away does not hide the point. Infinite: only one
             that agrees with the point does not.
+        seen: Where the view sees the boxes; None: not yet known.
     """
 
     depth: F32
@@ -79,9 +88,10 @@ class Lookup(NamedTuple):
     T_then_box: F64
     sizes: F64
     free_share: float
+    seen: SeenBoxes | None = None
 
 
-def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_share: float = np.inf) -> U8:
+def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
     A pixel's surface point is moved with the box it lies in, from where the actor is now to where it was when the frame was recorded, and
@@ -90,7 +100,6 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
     Args:
         picture: The recorded frame.
         target: The view.
-        boxes: Sizes of the actors.
         free_share: See `Lookup`.
 
     Returns:
@@ -98,13 +107,11 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
         not (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to
         an actor that was not there.
     """
-    now, T_box_world, sizes = placed_boxes(target.actors, boxes)
+    now, T_box_world, sizes, seen = target.placed
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([picture.actors.get(name, absent) for name in now]).reshape(-1, 4, 4)
-    T_then_world = inverse(picture.T_world_camera)
-    lookup = Lookup(
-        target.depth, target.K, target.T_world_camera, picture.K, T_then_world, picture.depth, T_box_world, T_then_box, sizes, free_share
-    )
+    view, then = (target.depth, target.K, target.T_world_camera), (picture.K, inverse(picture.T_world_camera), picture.depth)
+    lookup = Lookup(*view, *then, T_box_world, T_then_box, sizes, free_share, seen)
     x, y, held = warp_coordinates(lookup)
     out = np.empty((*held.shape, 4), np.uint8)
     colour = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -112,11 +119,21 @@ def warp(picture: Picture, target: WarpTarget, boxes: Mapping[str, Box], free_sh
     return out
 
 
-def placed_boxes(actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> tuple[list[str], F64, F64]:
-    """Return names, ``T_box_world (A, 4, 4)`` and sizes ``(A, 3)`` of the actors that have a box."""
-    now = [name for name in sorted(actors) if name in boxes]
-    T_box_world = inverse(np.array([actors[name] for name in now]).reshape(-1, 4, 4))
-    return now, T_box_world, np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in now]).reshape(-1, 3)
+class PlacedBoxes(NamedTuple):
+    """The A actors that have a box, as a camera sees them."""
+
+    names: list[str]
+    T_box_world: F64  # (A, 4, 4)
+    sizes: F64  # (A, 3) length, width and height, metres
+    seen: SeenBoxes
+
+
+def place_boxes(shape: tuple[int, ...], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> PlacedBoxes:
+    """Return the boxes of the actors present as a camera of ``shape`` rows and columns sees them."""
+    names = [name for name in sorted(actors) if name in boxes]
+    T_box_world = inverse(np.array([actors[name] for name in names]).reshape(-1, 4, 4))
+    sizes = np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in names]).reshape(-1, 3)
+    return PlacedBoxes(names, T_box_world, sizes, _seen_boxes(K, T_world_camera, T_box_world, sizes, shape))
 
 
 def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
@@ -125,7 +142,7 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     Returns:
         Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`, `INCONSISTENT` or 0 ``(H, W)``.
     """
-    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share = lookup
+    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share, seen = lookup
     height, width = depth.shape
     x, y, held = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is linear along a row.
@@ -134,7 +151,7 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     A, b = project[:, :3] @ ray, project[:, :3] @ T_world_camera[:3, 3] + project[:, 3]
     lines, then = np.ascontiguousarray(depth), np.ascontiguousarray(depth_then)
     _coordinates(lines, then, A, b, free_share, x, y, held)
-    seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, depth.shape)
+    seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, depth.shape) if seen is None else seen
     to_then: F64 = project @ T_then_box
     for i in reversed(range(len(sizes))):  # of two boxes the first counts
         part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
@@ -207,18 +224,10 @@ def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, fre
                 held[row, column] = _held(depth_then[int(v), int(u)], rz, free_share)
 
 
-def on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
-    """Return the pixels of a camera ``shape`` whose ray meets an actor's box.
-
-    Args:
-        shape: Rows and columns.
-        K, T_world_camera: Of the camera.
-        actors: ``T_world_box`` of the actors present.
-        boxes: Their sizes.
-    """
-    _, T_box_world, sizes = placed_boxes(actors, boxes)
+def on_boxes(shape: tuple[int, int], seen: SeenBoxes) -> Bool:
+    """Return the pixels of a camera of ``shape`` rows and columns whose ray meets a box."""
     out: Bool = np.zeros(shape, dtype=bool)
-    for ray, eye, walls, pixels in zip(*_seen_boxes(K, T_world_camera, T_box_world, sizes, shape), strict=True):
+    for ray, eye, walls, pixels in zip(*seen, strict=True):
         _add_box(ray, eye, walls, pixels, out[slice(*pixels[:2]), slice(*pixels[2:])])
     return out
 
@@ -233,6 +242,8 @@ class SeenBoxes(NamedTuple):
 
 
 def _seen_boxes(K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape: tuple[int, ...]) -> SeenBoxes:
+    if not len(sizes):
+        return SeenBoxes(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 2, 3)), np.empty((0, 4), np.int64))
     T_box_camera = T_box_world @ T_world_camera
     walls = _walls(sizes)
     corners = walls[:, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]  # (A, 8, 3)
@@ -272,11 +283,10 @@ def _add_box(ray, eye, walls, pixels, out):
             out[row, column] |= near < far
 
 
-def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> Bool:
-    """Return the same as `on_boxes`, array by array: the reference of its kernel."""
+def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64) -> Bool:
+    """Return the same as `on_boxes` of `PlacedBoxes`, array by array: the reference of its kernel."""
     rays = plain_points(np.ones(shape), K, T_world_camera) - T_world_camera[:3, 3]
     out: Bool = np.zeros(shape, dtype=bool)
-    _, T_box_world, sizes = placed_boxes(actors, boxes)
     for T_box, size in zip(T_box_world, sizes, strict=True):
         with np.errstate(divide="ignore"):
             hits = (_walls(size) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (rays @ T_box[:3, :3].T)
@@ -286,7 +296,7 @@ def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, actors: 
 
 def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
-    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share = lookup
+    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share, _ = lookup
     height, width = depth.shape
     points = plain_points(np.where(depth > 0, depth, INFINITY_M), K, T_world_camera)
     out, there, free = points.copy(), np.ones((height, width), dtype=bool), np.ones((height, width), dtype=bool)

@@ -36,14 +36,14 @@ def classes(clip: QualityClip) -> Iterator[U8]:
     recorded = clip.recorded
     if recorded is None:
         raise SystemExit(f"{clip.name} has no depth: it was made without references")
-    sizes, whole = recorded.sizes(), slice(None)
+    whole = slice(None)
     for i in range(len(clip.t_us)):
         view = recorded.target(i, recorded.K, whole, whole)
         T_world_rig = recorded.T_world_rig(i)
         height_m = (plain_points(view.depth, view.K, view.T_world_camera) - T_world_rig[:3, 3]) @ T_world_rig[:3, 2]
         out = np.where(np.abs(height_m) <= GROUND_M, 0, 1).astype(np.uint8)
         out[view.depth <= 0] = 3
-        out[on_boxes(view.depth.shape, view.K, view.T_world_camera, view.actors, sizes)] = 2
+        out[on_boxes(view.depth.shape, view.placed.seen)] = 2
         yield out
 
 

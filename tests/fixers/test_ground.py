@@ -10,7 +10,7 @@ import pytest
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.ground import carry, ground_hypothesis, with_users
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, on_boxes, plain_on_boxes, plain_points, warp
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, on_boxes, place_boxes, plain_on_boxes, plain_points, warp
 
 WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
 K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
@@ -45,7 +45,7 @@ def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
 
 def recorded(x_m: float, wall_m: float = np.inf) -> Picture:
     T, depth, rgb = street(x_m, wall_m)
-    return Picture(K, T, rgb, depth, NOBODY)
+    return Picture(K, T, rgb, depth, NOBODY, {})
 
 
 def off(image: U8, truth: U8, where: tuple[slice, slice]) -> float:
@@ -57,20 +57,20 @@ def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
     T, depth, truth = street(10.0)
     road = (slice(22, 40), slice(8, 56))
     depth[road] = fog_m
-    view = WarpTarget(K, T, depth, NOBODY)
+    view = WarpTarget(K, T, depth, NOBODY, {})
     pictures = [recorded(9.0), recorded(8.0)]
-    for image in carry(pictures, view, rig(10.0), {}):
+    for image in carry(pictures, view, rig(10.0)):
         assert off(image, truth, road) < 6
         assert (image[road][..., 3] == VALID).mean() > 0.9
-    assert off(warp(pictures[0], view, {}), truth, road) > 20
+    assert off(warp(pictures[0], view), truth, road) > 20
 
 
 def test_a_wall_beyond_which_the_plane_goes_on_keeps_its_own_depth() -> None:
     T, depth, truth = street(10.0, wall_m=20.0)
     wall = (slice(18, 23), slice(8, 56))  # the ground of these pixels lies up to four times as far
-    view, pictures = WarpTarget(K, T, depth, NOBODY), [recorded(7.0, 20.0), recorded(5.0, 20.0)]
-    assert (ground_hypothesis(view, rig(10.0), {})[20:23] > 11).any()
-    out, by_depth = carry(pictures, view, rig(10.0), {}), [warp(picture, view, {}) for picture in pictures]
+    view, pictures = WarpTarget(K, T, depth, NOBODY, {}), [recorded(7.0, 20.0), recorded(5.0, 20.0)]
+    assert (ground_hypothesis(view, rig(10.0))[20:23] > 11).any()
+    out, by_depth = carry(pictures, view, rig(10.0)), [warp(picture, view) for picture in pictures]
     for image, own in zip(out, by_depth, strict=True):
         assert off(image, truth, wall) < off(own, truth, wall) + 3
 
@@ -80,8 +80,8 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
     car, box = se2(8.0, 0.0, 0.0, 0.75), {"car": Box(4.0, 2.0, 1.5)}
     rear = (slice(18, 24), slice(30, 34))
     depth[rear] = 6.0
-    free = ground_hypothesis(WarpTarget(K, T, depth, NOBODY), rig(0.0), box)
-    held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}), rig(0.0), box)
+    free = ground_hypothesis(WarpTarget(K, T, depth, NOBODY, box), rig(0.0))
+    held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}, box), rig(0.0))
     assert (free[22:24, 30:34] > 0).all()
     assert (held[rear] == 0).all()
     aside = np.ones(depth.shape, bool)
@@ -91,12 +91,12 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
 
 def test_a_camera_that_looks_up_sees_no_ground_and_no_picture_gives_none() -> None:
     up = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, HEIGHT_M], [0, 0, 0, 1]])
-    view = WarpTarget(K, up, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY)
-    assert not ground_hypothesis(view, rig(0.0), {}).any()
+    view = WarpTarget(K, up, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY, {})
+    assert not ground_hypothesis(view, rig(0.0)).any()
     pictures = [recorded(9.0), recorded(8.0)]
-    for image, picture in zip(carry(pictures, view, rig(0.0), {}), pictures, strict=True):
-        np.testing.assert_array_equal(image, warp(picture, view, {}))
-    assert carry([], WarpTarget(K, *street(10.0)[:2], NOBODY), rig(10.0), {}) == ()
+    for image, picture in zip(carry(pictures, view, rig(0.0)), pictures, strict=True):
+        np.testing.assert_array_equal(image, warp(picture, view))
+    assert carry([], WarpTarget(K, *street(10.0)[:2], NOBODY, {}), rig(10.0)) == ()
 
 
 def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
@@ -106,7 +106,7 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
     rgb[rear] = 0  # it hid the road, of which its own reconstruction knows nothing, and has left since
     recorded_car = Picture(K, T, rgb, depth, {"car": then})
     here, own, _ = street(9.0)
-    image, _ = carry([with_users(recorded_car, box), recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY), rig(9.0), box)
+    image, _ = carry([with_users(recorded_car, box), recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY, box), rig(9.0))
     hidden = (slice(19, 25), slice(26, 38))
     assert (image[hidden][..., 3] == INCONSISTENT).all()
     assert (image[19:25, :20, 3] == VALID).all()
@@ -118,7 +118,8 @@ def test_where_a_box_is_seen_is_what_plain_arithmetic_says(seed: int) -> None:
     actors = {f"{i}": se2(*rng.uniform(-12, 12, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(1, 6)))}
     boxes = {name: Box(*rng.uniform(0.3, 6.0, 3)) for name in actors}
     T = se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD  # in some cases the camera stands in a box
-    found, plain = (of((HEIGHT, WIDTH), K, T, actors, boxes) for of in (on_boxes, plain_on_boxes))
+    placed = place_boxes((HEIGHT, WIDTH), K, T, actors, boxes)
+    found, plain = on_boxes((HEIGHT, WIDTH), placed.seen), plain_on_boxes((HEIGHT, WIDTH), K, T, placed.T_box_world, placed.sizes)
     assert (found != plain).mean() <= 1e-3  # a ray exactly along a wall may fall to either side
 
 
@@ -127,8 +128,8 @@ def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m: float
     T_world_rig = se2(3.0, -2.0, 0.7) @ np.array([[1.0, 0, 0, 0], [0, 0.99, -0.14, 0], [0, 0.14, 0.99, 0], [0, 0, 0, 1]])  # rolled
     T_rig_camera = FORWARD.copy()
     T_rig_camera[2, 3] = height_m
-    view = WarpTarget(K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY)
-    depth = ground_hypothesis(view, T_world_rig, {})
+    view = WarpTarget(K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY, {})
+    depth = ground_hypothesis(view, T_world_rig)
     assert (depth > 0).any() == (height_m == 1.5)  # from too far above the road is no plane
     below = plain_points(depth, K, view.T_world_camera)[depth > 0] - T_world_rig[:3, 3]
     assert np.abs(below @ T_world_rig[:3, 2]).max(initial=0) < 1e-4

@@ -43,14 +43,14 @@ def test_a_frame_warped_into_its_own_view_is_itself() -> None:
     depth = np.random.default_rng(1).uniform(2, 60, (HEIGHT, WIDTH)).astype(np.float32)
     depth[:8] = 0  # sky
     one = picture(at(3.0, 1.0, 0.3), depth)
-    out = warp(one, WarpTarget(K, one.T_world_camera, depth, {}), {})
+    out = warp(one, WarpTarget(K, one.T_world_camera, depth, {}, {}))
     assert (out[..., 3] == VALID).all()
     assert np.abs(out[..., :3].astype(int) - one.rgb).max() <= 1
 
 
 def test_a_wall_seen_from_nearer_is_larger() -> None:
     far, near = at(0.0), at(10.0)
-    out = warp(picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}), {})
+    out = warp(picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {}))
     # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
     expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
     assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
@@ -61,10 +61,10 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
     here = at(0.0)
     seen, depth = wall(20.0, here), wall(20.0, here)
     seen[:, 20:40] = 5.0  # a post hid the wall when the frame was recorded
-    out = warp(picture(here, seen), WarpTarget(K, here, depth, {}), {})
+    out = warp(picture(here, seen), WarpTarget(K, here, depth, {}, {}))
     assert (out[:, 20:40, 3] == INCONSISTENT).all()
     assert (out[:, :20, 3] == VALID).all()
-    aside = warp(picture(here, depth), WarpTarget(K, at(0.0, 12.0), depth, {}), {})  # 12 m to the left: 24 px at 20 m
+    aside = warp(picture(here, depth), WarpTarget(K, at(0.0, 12.0), depth, {}, {}))  # 12 m to the left: 24 px at 20 m
     assert (aside[:, :24, 3] == 0).all()
     assert (aside[:, 24:, 3] == VALID).all()
 
@@ -72,8 +72,8 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
 def test_nothing_but_the_rotation_moves_the_sky() -> None:
     sky = np.zeros((HEIGHT, WIDTH), np.float32)
     one = picture(at(0.0), sky, columns())
-    assert np.abs(warp(one, WarpTarget(K, at(40.0, 9.0), sky, {}), {})[..., 0].astype(int) - one.rgb[..., 0]).max() <= 1
-    turned = warp(one, WarpTarget(K, at(0.0, 0.0, 0.1), sky, {}), {})
+    assert np.abs(warp(one, WarpTarget(K, at(40.0, 9.0), sky, {}, {}))[..., 0].astype(int) - one.rgb[..., 0]).max() <= 1
+    turned = warp(one, WarpTarget(K, at(0.0, 0.0, 0.1), sky, {}, {}))
     middle = 32 - 40 * np.tan(0.1)  # a turn to the left looks at what lay left of the middle
     assert turned[HEIGHT // 2, 32, 0] == pytest.approx(4 * middle, abs=3)
 
@@ -86,11 +86,11 @@ def test_a_car_is_looked_up_where_it_was() -> None:
     depth[rows, car] = 18.0  # its rear
     before = np.zeros((HEIGHT, WIDTH), np.float32)
     before[:, :] = 12.0
-    out = warp(picture(here, before, columns(), {"car": then}), WarpTarget(K, here, depth, {"car": now}), {"car": box})
+    out = warp(picture(here, before, columns(), {"car": then}), WarpTarget(K, here, depth, {"car": now}, {"car": box}))
     middle = 32 - 40 * 3.0 / 12.0  # 3 m to the left at 12 m
     assert out[17, 31:33, 0].mean() == pytest.approx(4 * (middle - 0.5), abs=4)
     assert (out[rows, car, 3] == VALID).all()
-    gone = warp(picture(here, before, columns()), WarpTarget(K, here, depth, {"car": now}), {"car": box})
+    gone = warp(picture(here, before, columns()), WarpTarget(K, here, depth, {"car": now}, {"car": box}))
     assert (gone[rows, car, 3] == 0).all()
 
 

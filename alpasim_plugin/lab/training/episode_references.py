@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.references import ReferenceIndex
 from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, on_boxes
@@ -72,7 +72,7 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
     found = _opened(sequence)
     if found is None or not draw.count:
         return out
-    references, recorded, boxes = found
+    references, recorded = found
     K = _cropped(references.K, rows, columns)
     last: Sequence[int] = ()
     for t, i in enumerate(index):
@@ -83,7 +83,7 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
         used = chosen[draw.skipped :]
         places = [(j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j for slot, j in enumerate(used)]
         pictures = [_misplaced(_picture(sequence, at), error) for at, error in zip(places, draw.errors, strict=False)]
-        for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)), boxes)):
+        for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)))):
             out[t, slot] = carried
     return out
 
@@ -94,10 +94,9 @@ def road_users(sequence: PairSequence, index: I64, rows: slice, columns: slice) 
     found = _opened(sequence)
     if found is None:
         return np.zeros((len(index), *shape), dtype=bool)
-    references, _, boxes = found
+    references, _ = found
     K = _cropped(references.K, rows, columns)
-    views = (references.target(int(i), K, rows, columns) for i in index)
-    return np.stack([on_boxes(shape, K, view.T_world_camera, view.actors, boxes) for view in views])
+    return np.stack([on_boxes(shape, references.target(int(i), K, rows, columns).placed.seen) for i in index])
 
 
 def _cropped(K: F64, rows: slice, columns: slice) -> F64:
@@ -156,9 +155,9 @@ def _misplaced(picture: Picture, error: F64) -> Picture:
 
 
 @lru_cache(maxsize=OPEN_SEQUENCES)
-def _opened(sequence: PairSequence) -> tuple[SequenceReferences, ReferenceIndex, dict[str, Box]] | None:
+def _opened(sequence: PairSequence) -> tuple[SequenceReferences, ReferenceIndex] | None:
     found = open_references(sequence)
-    return None if found is None else (found, found.index(), found.sizes())
+    return None if found is None else (found, found.index())
 
 
 @lru_cache(maxsize=PICTURES)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,17 +63,18 @@ class SequenceReferences:
 
     def warped(self, frames: int, count: int, past: bool = False) -> Iterator[tuple[U8, ...]]:
         """Yield the references of the first frames, at most ``count`` each, as the closed loop gives them."""
-        index, sizes, whole = self.index(), self.sizes(), slice(None)
+        index, whole = self.index(), slice(None)
         last: Sequence[int] = ()
         picture = lru_cache(count + 1)(self.picture)  # most are those of the frame before, as in a drive
         for i in range(frames):
             last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
             target = self.target(i, self.K, whole, whole)
-            yield carry([picture(j) for j in last], target, self.T_world_rig(i), sizes)
+            yield carry([picture(j) for j in last], target, self.T_world_rig(i))
 
     def target(self, i: int, K: F64, rows: slice, columns: slice) -> WarpTarget:
         """Return a crop of frame ``i`` as a view; ``K`` is that of the crop."""
-        return WarpTarget(K, self.T_world_camera[i], self.depth[i, rows, columns].astype(np.float32), _named(self.actors[i]))
+        depth = self.depth[i, rows, columns].astype(np.float32)
+        return WarpTarget(K, self.T_world_camera[i], depth, _named(self.actors[i]), self.sizes)
 
     def T_world_rig(self, i: int) -> F64:
         """Return the pose of the rig at frame ``i``."""
@@ -84,8 +85,9 @@ class SequenceReferences:
         """Return recorded frame ``i``."""
         depth = self.rgb_depth[i].astype(np.float32)
         picture = Picture(self.K, self.rgb_T_world_camera[i], np.ascontiguousarray(self.rgb[i]), depth, _named(self.rgb_actors[i]))
-        return with_users(picture, self.sizes())
+        return with_users(picture, self.sizes)
 
+    @cached_property
     def sizes(self) -> dict[str, Box]:
         """Return the actors' boxes."""
         return {str(a): Box(*map(float, size)) for a, size in enumerate(self.boxes)}
