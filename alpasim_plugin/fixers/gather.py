@@ -168,7 +168,7 @@ def _likeness(sought, shown, out):
 def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
     """Return the same as `nets.reference_blend.offsets`, of float32 tensors on the CPU, to rounding; it has no gradient."""
     out = torch.empty(at2.shape)
-    _offsets(*(np.ascontiguousarray(x.numpy()) for x in (at2, at4)), out.numpy())
+    _offsets(at2.numpy(), np.ascontiguousarray(at4.numpy()), out.numpy())  # the first is a part of what the head says, read in its place
     return out
 
 
@@ -202,8 +202,8 @@ def _offsets(at2, at4, out):
 def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
     """Return the same as `nets.reference_blend.mix`, of float32 tensors on the CPU, to rounding."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
-    images = (np.ascontiguousarray(x.numpy()) for x in (repaired, references, *heads))
-    _mix(*images, out.numpy(), recorded.numpy())
+    repaired_, references_, offset_px = (np.ascontiguousarray(x.numpy()) for x in (repaired, references, heads.offset_px))
+    _mix(repaired_, references_, heads.weight.numpy(), offset_px, heads.correction.numpy(), out.numpy(), recorded.numpy())
     return out, recorded
 
 
@@ -329,8 +329,9 @@ def draw_and_gather() -> None:
     gather_cells_cpu(image, image[..., :1], image, state, image + 1)
     references, at2, at4 = torch.zeros(1, 1, side_px, side_px, 4), image[:, ::DETAIL, ::DETAIL, :2], image[:, ::CELL, ::CELL]
     gather_beside_cpu(references, image)
-    offset_px = offsets_cpu(at2, at4[..., :2])[:, None]
-    heads = BlendHeads(offset_px.repeat(1, 1, 1, 1, 2), offset_px, offset_px.repeat(1, 1, 1, 1, 6))
+    said = at2[:, None].repeat(1, 1, 1, 1, 9)
+    weight, offset, correction = said.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
+    heads = BlendHeads(weight, offsets_cpu(offset[:, 0], at4[..., :2])[:, None], correction)
     likeness_cpu(at4, at4)
     mix_cpu(image, references, heads)
     trust(image[0].numpy(), image[0].numpy(), image[0, ..., 0].numpy())
