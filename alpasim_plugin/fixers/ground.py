@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
+from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
 
 I32 = npt.NDArray[np.int32]
 
@@ -29,18 +30,19 @@ HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind s
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
-def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64) -> tuple[U8, ...]:
+def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, threads: int = 1) -> tuple[U8, ...]:
     """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of every pixel.
 
     Args:
         pictures: Recorded frames as of `with_users`, nearest first; the first two are compared.
         target: The view; where a ray meets the box of an actor, the render's depth counts.
         T_world_rig: ``(4, 4)`` of a rig near the view; the plane z = 0 of it is the ground.
+        threads: As many pictures are carried at a time; the result does not depend on it.
 
     Returns:
         For each picture ``(H, W, 4)`` uint8: see `warp`.
     """
-    by_depth = [warp(picture, target) for picture in pictures]
+    by_depth = _warp_all(pictures, target, np.inf, threads)
     depth = ground_hypothesis(target, T_world_rig)
     rows = np.flatnonzero(depth.any(axis=1))
     if not by_depth or not len(rows):
@@ -49,7 +51,7 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64) -> 
     K = target.K.copy()
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
-    by_ground = [warp(_hidden_by_users(picture), view, FREE_SHARE) for picture in pictures]
+    by_ground = _warp_all([_hidden_by_users(picture) for picture in pictures], view, FREE_SHARE, threads)
     ground = view.depth > 0
     if len(pictures) > 1:
         size = window_px(K)
@@ -59,6 +61,18 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64) -> 
     for image, on_ground in zip(by_depth, by_ground, strict=True):
         cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
     return tuple(by_depth)
+
+
+def _warp_all(pictures: Sequence[Picture], target: WarpTarget, free_share: float, threads: int) -> list[U8]:
+    out: dict[int, U8] = {}
+    todo = iter(range(len(pictures)))  # shared: each thread takes the next
+
+    def work() -> None:
+        for i in todo:
+            out[i] = warp(pictures[i], target, free_share)
+
+    run_on_threads(max(1, min(threads, len(pictures))), work)
+    return [out[i] for i in range(len(pictures))]
 
 
 def window_px(K: F64) -> int:

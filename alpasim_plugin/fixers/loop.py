@@ -17,6 +17,7 @@ from alpasim_plugin.core.lazy import installed
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.plugins.parts import complete
 from alpasim_plugin.plugins.parts.spec import MODES
@@ -192,7 +193,8 @@ def fixed_renderer(
     scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
     references = None
     if settings.references and recorded:
-        references = ReferenceSession(recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording)
+        of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
+        references = ReferenceSession(*of, threads=thread_count(threads))
     runner = BlockRunner(render, scene_map, scenario.actors, threads, references)
 
     def make() -> Fixer:

@@ -79,6 +79,7 @@ class ReferenceSession:
         which: ``all`` of the recording, or only what was recorded before the frame's time.
         hysteresis: Whether a camera keeps its references a little longer than they are nearest. Without it the references of a view do not
             depend on what came before, as a server of several drives needs.
+        threads: Threads that carry them.
     """
 
     def __init__(
@@ -89,8 +90,10 @@ class ReferenceSession:
         count: int,
         which: Literal["all", "past"] = "all",
         hysteresis: bool = True,
+        threads: int = 1,
     ) -> None:
         self.index, self.count, self.past, self.hysteresis = ReferenceIndex(recorded), count, which == "past", hysteresis
+        self.threads = threads
         self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
         self._last: dict[str, tuple[int, ...]] = {}
         self._pictures: OrderedDict[int, Picture] = OrderedDict()
@@ -120,7 +123,7 @@ class ReferenceSession:
             K[1, 2] -= top
             target = WarpTarget(K, band.T_world_camera, frame.depth[top:end], band.actors, self._boxes)
             own = slice(band.rows.start - top, band.rows.stop - top), band.columns
-            for whole, part in zip(out, carry(pictures, target, T_world_rig), strict=True):
+            for whole, part in zip(out, carry(pictures, target, T_world_rig, self.threads), strict=True):
                 band.put(whole, part[own])
         return out
 

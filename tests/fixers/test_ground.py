@@ -45,7 +45,7 @@ def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
 
 def recorded(x_m: float, wall_m: float = np.inf) -> Picture:
     T, depth, rgb = street(x_m, wall_m)
-    return Picture(K, T, rgb, depth, NOBODY, {})
+    return Picture(K, T, rgb, depth, NOBODY)
 
 
 def off(image: U8, truth: U8, where: tuple[slice, slice]) -> float:
@@ -59,7 +59,8 @@ def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
     depth[road] = fog_m
     view = WarpTarget(K, T, depth, NOBODY, {})
     pictures = [recorded(9.0), recorded(8.0)]
-    for image in carry(pictures, view, rig(10.0)):
+    for image, by_two in zip(carry(pictures, view, rig(10.0)), carry(pictures, view, rig(10.0), threads=2), strict=True):
+        np.testing.assert_array_equal(image, by_two)
         assert off(image, truth, road) < 6
         assert (image[road][..., 3] == VALID).mean() > 0.9
     assert off(warp(pictures[0], view), truth, road) > 20

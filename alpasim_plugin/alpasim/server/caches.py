@@ -18,6 +18,7 @@ from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.log.schema import wire_camera
 from alpasim_plugin.plugins.interfaces import BlockRule, Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
@@ -145,7 +146,7 @@ class SceneCache:
         kept: int = 4,
     ) -> None:
         self._spec, self._needs_map, self.kept = spec, needs_map, kept
-        self._session = {"seed": seed, "device": device, "threads": threads}
+        self._threads, self._session = threads, {"seed": seed, "device": device, "threads": threads}
         self._sources: dict[str, str | Path] = {}
         self._loaded: OrderedDict[str, SceneEntry] = OrderedDict()
         self._lock, self._loading = threading.Lock(), threading.Lock()
@@ -206,8 +207,8 @@ class SceneCache:
             recorded = renderer.recorded() if isinstance(settings, FixerSettings) and settings.references else ()
             if recorded:
                 assert isinstance(settings, FixerSettings)
-                how_many, which = settings.references, settings.recording
-                references = ReferenceSession(recorded, scenario.actors, scenario.ego_log, how_many, which, hysteresis=False)
+                of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
+                references = ReferenceSession(*of, hysteresis=False, threads=thread_count(self._threads))
         return SceneEntry(scenario, prepare_map(scenario.lane_map) if self._needs_map else None, renderer, references)
 
     def _enter(self, source: str | Path) -> None:
