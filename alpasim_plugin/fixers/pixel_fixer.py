@@ -31,12 +31,13 @@ from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 @dataclass(frozen=True)
 class PixelInputs:
-    """One frame of B cameras; sides are multiples of 16."""
+    """One frame of B cameras; sides are multiples of 16 ``scale``."""
 
     render: Tensor  # (B, H, W, 3) in [-1, 1]
     opacity: Tensor  # (B, H, W, 1), 0 to 1
     sdmap: Tensor  # (B, H, W, 3) in [-1, 1]; black where there is no map
     references: Tensor | None = None  # (B, K, H, W, 4) colour in [-1, 1], and where it holds, 0 to 1
+    scale: int = 1  # the network looks at pictures that are this many times smaller
 
 
 @torch.inference_mode()
@@ -61,10 +62,10 @@ def fix_frame(
     """
     render = inputs.render
     images = render, inputs.opacity, inputs.sdmap, state
-    out, after = generator.step(*images, source(0), inputs.references)
+    out, after = generator.step(*images, source(0), inputs.references, scale=inputs.scale)
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
-        t = level.sigma
-        out, after = generator.net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t), inputs.references)
+        t = render.new_full((len(render),), level.sigma)
+        out, after = generator.step(*images, interpolant(out, source(index), level.sigma), inputs.references, t, inputs.scale)
     if settings.keep_render:
         kept = keep_render(out, render, inputs.opacity, inputs.sdmap, state.output, after.recorded)
         if kept is not None:
@@ -172,10 +173,10 @@ class PixelFixer(Fixer):
 
     def _fix(self, view: Views, histories: Mapping[str, CameraHistory]) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
         """Return per camera its name, the places of its frames in the block, its history after the frame, and the guard's event."""
-        net, device = self.generator.net, self.generator.device
-        inputs = to_inputs(view, device)
+        start, device = self.generator.step.start, self.generator.device
+        inputs = to_inputs(view, device, self.settings.scale_of(*view.shape))
         pasts = [histories.get(camera) for camera in view.cameras]
-        states = [net.start(inputs.render[b : b + 1]) if past is None else past.state for b, past in enumerate(pasts)]
+        states = [start(inputs.render[b : b + 1], inputs.scale) if past is None else past.state for b, past in enumerate(pasts)]
         counts = [0 if past is None else past.frames for past in pasts]
         height, width = view.shape
 
@@ -200,7 +201,7 @@ class PixelFixer(Fixer):
             event = guard.check_frames(video[b, :height, :width].permute(2, 0, 1)[:, None], images[b : b + 1], raw[None], before)[0]
             state = PixelState(*(part[b : b + 1] for part in after))
             if event == guard.NAN:  # it would stay in the state for ever
-                state = net.start(inputs.render[b : b + 1])
+                state = start(inputs.render[b : b + 1], inputs.scale)
             found.append((camera, view.index[b], CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]), event))
         return found
 
@@ -213,10 +214,10 @@ def _trust(made: CameraHistory) -> dict[str, float | str]:
     return trust(output, render, recorded[..., 0])
 
 
-def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:
-    """Convert one frame of views to tensors: ``x / 127.5 - 1``, edges repeated up to multiples of 16."""
+def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:
+    """Convert one frame of views to tensors: ``x / 127.5 - 1``, edges repeated up to multiples of 16 ``scale``."""
     height, width = view.shape
-    right, below = -width % GRID_PX, -height % GRID_PX
+    right, below = -width % (GRID_PX * scale), -height % (GRID_PX * scale)
 
     def image(x: np.ndarray) -> Tensor:
         if right or below:
@@ -233,4 +234,4 @@ def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:
             padded = np.pad(padded, ((0, 0), (0, 0), (0, below), (0, right), (0, 0)))
         references = torch.from_numpy(padded).to(device).float().mul_(1 / HALF).sub_(1)
         references[..., 3:].add_(1).mul_(0.5)
-    return PixelInputs(render, opacity, sdmap, references)
+    return PixelInputs(render, opacity, sdmap, references, scale)

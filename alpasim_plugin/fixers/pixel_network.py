@@ -2,18 +2,25 @@
 
 The network has some forty small operations, and Python between them takes a tenth of a frame's time on a CPU. A recording (TorchScript,
 frozen weights) runs the same operations without it.
+
+A picture larger than those of the training is looked at ``scale`` times smaller: the network's change of the render, the weights, offsets
+and corrections of the references are enlarged, and render and references are blended at their own size (joint upsampling; Kopf et al.,
+2007), so what is sharp in them stays sharp.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Literal
 
+import cv2
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
@@ -22,8 +29,9 @@ from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
-from alpasim_plugin.nets.pixel_generator import GatheredCells, PixelGenerator, PixelSizes, PixelState
-from alpasim_plugin.nets.reference_blend import BesideCells, BlendHeads
+from alpasim_plugin.nets.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
+from alpasim_plugin.nets.pixel_layers import cells, pixels
+from alpasim_plugin.nets.reference_blend import DETAIL, BesideCells, BlendHeads, gather_beside, mix, sources_of
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -35,7 +43,7 @@ class LoadedGenerator:
     """A generator ready to run; read-only and stateless, so rollouts share it."""
 
     net: PixelGenerator
-    step: Callable[..., tuple[Tensor, PixelState]]  # the same at t = 1
+    step: GeneratorStep  # the same for pictures of any size
     trained: bool
     note: str  # description of the weights, for labels
     precision: Choice
@@ -64,7 +72,7 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
     if device == "cpu" and net.blend is not None:
         net.blend.likeness, net.blend.offsets = likeness_cpu, offsets_cpu
-    step = RecordedStep(net) if device == "cpu" else partial(_step_on, net)
+    step = RecordedStep(net) if device == "cpu" else GeneratorStep(net)
     return LoadedGenerator(net, step, trained, note, precision, torch.device(device))
 
 
@@ -80,43 +88,130 @@ def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
     return net
 
 
-def _step_on(
-    net: PixelGenerator, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, references: Tensor | None = None
-) -> tuple[Tensor, PixelState]:
-    """Call a generator at t = 1 on another device."""
-    out: tuple[Tensor, PixelState] = net(render, opacity, sdmap, state, source, None, references)
-    return out
-
-
-class RecordedStep:
-    """Call a generator on the CPU at t = 1; equal to calling the network, to rounding.
+class GeneratorStep:
+    """Call a generator for pictures of any size.
 
     Args:
         net: In evaluation mode, never written to.
-        after: Calls of a shape before it is recorded; None records nothing.
+    """
+
+    def __init__(self, net: PixelGenerator) -> None:
+        self.net = net
+
+    def start(self, render: Tensor, scale: int = 1) -> PixelState:
+        """Return the state before a rollout; see `PixelGenerator.start`. Pictures have their own size, recurrent channels the network's."""
+        hidden = self.net.start(smaller(render, scale))
+        return hidden._replace(output=render, render=render, recorded=torch.zeros_like(render[..., :1]))
+
+    def __call__(
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        state: PixelState,
+        source: Tensor,
+        references: Tensor | None = None,
+        t: Tensor | None = None,
+        scale: int = 1,
+    ) -> tuple[Tensor, PixelState]:
+        """Return the clean frame and the state after it; see `PixelGenerator.forward`, whose arguments these are.
+
+        Args:
+            render, opacity, sdmap, state, source, references, t: Sides are multiples of 16 ``scale``.
+            scale: The network looks at pictures that are this many times smaller.
+        """
+        seen = smaller(render, scale)
+        past = state._replace(output=smaller(state.output, scale), render=smaller(state.render, scale))
+        warped = None
+        if references is not None and self.net.blend is not None:
+            warped = smaller(references.flatten(0, 1), scale).reshape(*references.shape[:2], *seen.shape[1:3], -1)
+        noised = seen if source is render else smaller(source, scale)
+        made = self.before_blend(seen, smaller(opacity, scale), smaller(sdmap, scale), past, noised, warped, t)
+        out, heads, recorded = made.repaired, made.heads, torch.zeros_like(render[..., :1])
+        if scale > 1:
+            out = render + larger(made.repaired - seen, scale)
+            heads = None if heads is None else larger_heads(heads, scale)
+        if heads is not None and references is not None:
+            out, recorded = self.mix(out, references, heads)
+        return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
+
+    def before_blend(
+        self, render: Tensor, opacity: Tensor, sdmap: Tensor, past: PixelState, source: Tensor, warped: Tensor | None, t: Tensor | None
+    ) -> BeforeBlend:
+        """Run the network on what it looks at."""
+        beside = None if warped is None else gather_beside(warped, render)
+        return self.net.before_blend(gather_cells(render, opacity, sdmap, past, source), render, past, t, beside)
+
+    def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
+        """Blend at full size; see `nets.reference_blend.mix`."""
+        return mix(sources_of(repaired, references, heads))
+
+
+class RecordedStep(GeneratorStep):
+    """Call a generator on the CPU; equal to calling the network, to rounding.
+
+    Args:
+        net: In evaluation mode, never written to.
+        after: Calls of a shape at t = 1 before it is recorded; None records nothing.
     """
 
     def __init__(self, net: PixelGenerator, after: int | None = AFTER) -> None:
+        super().__init__(net)
         self._step, self._after = _Step(net).eval(), after
         self._calls: Counter[tuple[int, ...]] = Counter()
         self.recorded: dict[tuple[int, ...], Any] = {}
 
-    def __call__(
-        self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, references: Tensor | None = None
-    ) -> tuple[Tensor, PixelState]:
-        """Return the clean frame and the state after it; see `PixelGenerator.forward`."""
-        reads = references is not None and self._step.net.blend is not None
-        beside = gather_beside_cpu(references, render) if reads and references is not None else ()
-        tensors = *gather_cells_cpu(render, opacity, sdmap, state, source), render, *state, *beside
+    def before_blend(
+        self, render: Tensor, opacity: Tensor, sdmap: Tensor, past: PixelState, source: Tensor, warped: Tensor | None, t: Tensor | None
+    ) -> BeforeBlend:
+        """Run the network, or its recording, on what it looks at."""
+        beside = () if warped is None else gather_beside_cpu(warped, render)
+        cells = gather_cells_cpu(render, opacity, sdmap, past, source)
+        if t is not None:
+            return self.net.before_blend(cells, render, past, t, BesideCells(*beside) if beside else None)
+        tensors = *cells, render, *past, *beside
         shape = *render.shape, *(part.shape[0] for part in beside)
         self._calls[shape] += 1
         if self._after is not None and shape not in self.recorded and self._calls[shape] > self._after:
             self.recorded[shape] = _record(self._step, tensors)
         out, hidden, kept, frames, *heads = self.recorded.get(shape, self._step)(*tensors)
-        recorded = torch.zeros_like(render[..., :1])
-        if heads and references is not None:
-            out, recorded = mix_cpu(out, references, BlendHeads(*heads))
-        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames, recorded)
+        return BeforeBlend(out, hidden, kept, frames, BlendHeads(*heads) if heads else None)
+
+    def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
+        """Blend at full size in one compiled pass."""
+        return mix_cpu(repaired, references, heads)
+
+
+def smaller(x: Tensor, scale: int) -> Tensor:
+    """Average pictures ``(B, H, W, C)`` of at most four channels over squares of ``scale`` pixels."""
+    if scale == 1:
+        return x
+    if x.device.type != "cpu":
+        return F.avg_pool2d(x.permute(0, 3, 1, 2), scale).permute(0, 2, 3, 1)
+    return _resized(x, 1 / scale, cv2.INTER_AREA)
+
+
+def larger(x: Tensor, scale: int) -> Tensor:
+    """Enlarge pictures ``(B, H, W, C)`` bilinearly."""
+    if x.device.type != "cpu":
+        return F.interpolate(x.permute(0, 3, 1, 2), scale_factor=scale, mode="bilinear", align_corners=False).permute(0, 2, 3, 1)
+    return _resized(x, scale, cv2.INTER_LINEAR)
+
+
+def larger_heads(heads: BlendHeads, scale: int) -> BlendHeads:
+    """Return what a picture ``scale`` times as large is blended with: pixel by pixel for weights and corrections, offsets in its pixels."""
+    b, k = heads.weight.shape[:2]
+    weight, offset, correction = (part.flatten(0, 1) for part in heads)
+    fine = larger(torch.cat([pixels(weight, DETAIL), pixels(correction, DETAIL)], dim=-1), scale)
+    parts = cells(fine[..., :1], DETAIL), larger(offset, scale) * scale, cells(fine[..., 1:], DETAIL)
+    return BlendHeads(*(part.reshape(b, k, *part.shape[1:]) for part in parts))
+
+
+def _resized(x: Tensor, by: float, how: int) -> Tensor:
+    """Resize by OpenCV, which is several times as fast as torch where channels come last."""
+    size = round(x.shape[2] * by), round(x.shape[1] * by)
+    images = [cv2.resize(one, size, interpolation=how).reshape(size[1], size[0], x.shape[3]) for one in x.contiguous().numpy()]
+    return torch.from_numpy(images[0][None] if len(images) == 1 else np.stack(images))
 
 
 class _Step(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -33,7 +34,8 @@ class PixelSizesSettings(Part):
     blend: int = Field(default=0, ge=0, description="Channels of the head that blends references with the picture; 0: none are read.")
 
 
-PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map", "references", "recording"))
+USUAL_PX = 256 * 144  # of most pictures of the training
+PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map", "references", "recording", "scale"))
 
 
 class FrameByFrameSettings(FixerSettings):
@@ -68,9 +70,23 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
     keep_render: bool = Field(
         default=True, description="Keep the render where it is opaque, the change is large, and neither map nor history supports it."
     )
+    scale: Literal["auto"] | Positive = Field(
+        default="auto",
+        description="The network looks at a picture this many times smaller; render and references are blended at full size. "
+        "auto: the largest that leaves as many pixels as 256x144 has, the usual size of the training.",
+    )
     precision: Literal["auto", "fp32", "bf16"] = Field(
         default="auto", description="Of the network. auto: bf16 on a GPU and where a probe finds it at least 1.5 times as fast, else fp32."
     )
+
+    def scale_of(self, height: int, width: int) -> int:
+        """Return how many times smaller the network looks at pictures of a size.
+
+        Example:
+            >>> [PixelFixerSettings(name="onefixer").scale_of(*size) for size in ((144, 256), (270, 480), (288, 512), (1080, 1920))]
+            [1, 1, 2, 7]
+        """
+        return max(1, math.isqrt(height * width // USUAL_PX)) if self.scale == "auto" else self.scale
 
     @property
     def unit(self) -> Unit:

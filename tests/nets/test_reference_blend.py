@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.fixers.pixel_network import RecordedStep
+from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep, larger_heads
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
-from alpasim_plugin.nets.reference_blend import _sampled
+from alpasim_plugin.nets.reference_blend import BlendHeads, _sampled
 
 SIZES = PixelSizes((16, 16, 16), blend=8)
-HEIGHT, WIDTH = 32, 48
+HEIGHT, WIDTH = 32, 64
 
 
 def trained_like(seed: int = 0) -> PixelGenerator:
@@ -78,6 +79,39 @@ def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None
     for a, b in ((fast, plain), (after.recorded, state.recorded)):
         assert float((a - b).abs().quantile(0.99)) < 1e-4
         assert float((a - b).abs().max()) < 1e-2
+
+
+@pytest.mark.parametrize("references", [0, 2])
+def test_a_network_that_looks_at_smaller_pictures_blends_at_full_size(references: int) -> None:
+    net = trained_like()
+    render, opacity, sdmap, images = inputs(references, 2)
+    given = images if references else None
+    plain, fast = GeneratorStep(net), RecordedStep(net, after=1)
+    start = plain.start(render, 2)
+    assert start.hidden.shape[1] * 2 == net.start(render).hidden.shape[1]
+    assert torch.equal(start.output, render)
+    one, after = plain(render, opacity, sdmap, start, render, given, scale=2)
+    for _ in range(3):
+        other, _ = fast(render, opacity, sdmap, start, render, given, scale=2)
+    assert one.shape == after.render.shape == render.shape
+    assert float((one - other).abs().quantile(0.99)) < 1e-4
+
+    seen = [F.avg_pool2d(x.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1) for x in (render, opacity, sdmap)]
+    if references == 0:  # the change of the render is all there is, and it is enlarged
+        small, _ = call(net, *seen, None)
+        change = F.interpolate((small - seen[0]).permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+        assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
+
+
+def test_enlarged_heads_say_of_every_pixel_what_its_cell_said() -> None:
+    source = torch.Generator().manual_seed(3)
+    flat = [torch.rand(1, 2, 1, 1, n, generator=source).expand(-1, -1, 4, 6, -1) for n in (1, 2, 3)]
+    weight, offset, correction = flat
+    heads = BlendHeads(weight.repeat(1, 1, 1, 1, 4), offset.contiguous(), correction.repeat(1, 1, 1, 1, 4))
+    out = larger_heads(heads, 3)
+    assert torch.allclose(out.weight, weight[:, :, :1, :1].expand(-1, -1, 12, 18, 4))
+    assert torch.allclose(out.offset_px, 3 * offset[:, :, :1, :1].expand(-1, -1, 12, 18, 2))
+    assert torch.allclose(out.correction, correction[:, :, :1, :1].repeat(1, 1, 12, 18, 4))
 
 
 def test_sizes_with_a_blending_head_are_read_off_the_tensors() -> None:
