@@ -199,53 +199,74 @@ def _offsets(at2, at4, out):
             out[n, y] = row.reshape(width, axes)
 
 
-def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
-    """Return the same as `nets.reference_blend.mix`, of float32 tensors on the CPU, to rounding."""
+def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1) -> tuple[Tensor, Tensor]:
+    """Return the same as `nets.reference_blend.mix` of `sources_of`, of float32 tensors on the CPU, to rounding."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
-    repaired_, references_, offset_px = (np.ascontiguousarray(x.numpy()) for x in (repaired, references, heads.offset_px))
-    _mix(repaired_, references_, heads.weight.numpy(), offset_px, heads.correction.numpy(), out.numpy(), recorded.numpy())
+    repaired_, references_ = (np.ascontiguousarray(x.numpy()) for x in (repaired, references))
+    _mix(repaired_, references_, *(part.numpy() for part in heads), scale, out.numpy(), recorded.numpy())
     return out, recorded
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _mix(repaired, references, weight, offset_px, correction, out, recorded):
-    """Blend a row at a time: where each pixel is looked up, what is found there, its share; all in float32, so that rows are vectors."""
+def _mix(repaired, references, weight, offset_px, correction, scale, out, recorded):
+    """Blend a row at a time: where each pixel is looked up, what is found there, its share; all in float32, so that rows are vectors.
+
+    What the heads say is ``scale`` times coarser than the picture, offsets twice that, and is interpolated between the middles.
+    """
     batch, count, height, width, _ = references.shape
     one, zero, largest, nowhere = np.float32(1.0), np.float32(0.0), np.float32(LARGEST), np.float32(NOWHERE)
     right, below = np.float32(width - 1), np.float32(height - 1)
-    x0, y0 = np.empty(width, np.int32), np.empty(width, np.int32)
-    fx, fy = np.empty(width, np.float32), np.empty(width, np.float32)
-    total, share = np.empty(width, np.float32), np.empty(width, np.float32)
-    found, blended = np.empty((width, CHANNELS), np.float32), np.empty((width, 3), np.float32)
+    y0, y1, fy = _between(height, scale)
+    x0, x1, fx = _between(width, scale)
+    v0, v1, fv = _between(height, scale * DETAIL)
+    u0, u1, fu = _between(width, scale * DETAIL)
+    said, rows = np.empty((width, CHANNELS), np.float32), np.empty((width // (scale * DETAIL), 2), np.float32)
+    near, far = np.empty((width // scale, CHANNELS), np.float32), np.empty((width // scale, CHANNELS), np.float32)
+    total, share, found = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((width, CHANNELS), np.float32)
+    blended = np.empty((width, 3), np.float32)
     for b in range(batch):
         for y in range(height):
-            i, into_row = y // DETAIL, y % DETAIL * DETAIL
-            other = max(i - 1, 0) if y % DETAIL == 0 else min(i + 1, height // DETAIL - 1)
             total[:] = one
             blended[:] = repaired[b, y]
             for k in range(count):
-                _lookups(offset_px[b, k, i], offset_px[b, k, other], np.float32(y), right, below, x0, y0, fx, fy)
+                upper, lower = offset_px[b, k, v0[y]], offset_px[b, k, v1[y]]
+                for j in range(rows.shape[0]):
+                    for c in range(2):
+                        rows[j, c] = np.float32(scale) * (upper[j, c] + fv[y] * (lower[j, c] - upper[j, c]))
                 image = references[b, k]
                 for x in range(width):
-                    left, top = x0[x], y0[x]
+                    i, j = u0[x], u1[x]
+                    px = np.float32(x) + rows[i, 0] + fu[x] * (rows[j, 0] - rows[i, 0])
+                    py = np.float32(y) + rows[i, 1] + fu[x] * (rows[j, 1] - rows[i, 1])
+                    px, py = min(max(px, zero), right), min(max(py, zero), below)
+                    left, top = np.int32(px), np.int32(py)
+                    a, g = px - np.float32(left), py - np.float32(top)
                     upper, lower = image[top], image[min(top + 1, height - 1)]
                     beside = min(left + 1, width - 1)
-                    a11 = fy[x] * fx[x]
-                    a01, a10 = fx[x] - a11, fy[x] - a11
-                    a00 = one - fx[x] - a10
+                    a11 = g * a
+                    a01, a10 = a - a11, g - a11
+                    a00 = one - a - a10
                     for c in range(CHANNELS):
                         found[x, c] = a00 * upper[left, c] + a01 * upper[beside, c] + a10 * lower[left, c] + a11 * lower[beside, c]
-                said = weight[b, k, i]
+                _said(weight[b, k], correction[b, k], y0[y], near)
+                if scale == 1:
+                    said = near
+                else:
+                    _said(weight[b, k], correction[b, k], y1[y], far)
+                    for j in range(near.shape[0]):
+                        for c in range(CHANNELS):
+                            near[j, c] += fy[y] * (far[j, c] - near[j, c])
+                    for x in range(width):
+                        for c in range(CHANNELS):
+                            said[x, c] = near[x0[x], c] + fx[x] * (near[x1[x], c] - near[x0[x], c])
                 for x in range(width):
-                    share[x] = min(said[x // DETAIL, into_row + x % DETAIL], largest)
+                    share[x] = min(said[x, 3], largest)
                 _exponentials(share)
-                extra = correction[b, k, i]
                 for x in range(width):
                     part = share[x] * min(max(found[x, 3], nowhere), one)
                     total[x] += part
-                    at = 3 * (into_row + x % DETAIL)
                     for c in range(3):
-                        blended[x, c] += part * (found[x, c] + extra[x // DETAIL, at + c])
+                        blended[x, c] += part * (found[x, c] + said[x, c])
             for x in range(width):
                 over = one / total[x]
                 for c in range(3):
@@ -253,26 +274,28 @@ def _mix(repaired, references, weight, offset_px, correction, out, recorded):
                 recorded[b, y, x, 0] = max(one - over, zero)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _lookups(near, far, y, right, below, x0, y0, fx, fy):
-    """Write where the pixels of a row look a reference up: whole columns and rows, and what is beyond them.
+@njit(cache=True, nogil=True)
+def _between(length, scale):
+    """Return for each pixel of a row or column the values before and after it, ``scale`` pixels wide, and the share of the second."""
+    before, after, share = np.empty(length, np.int32), np.empty(length, np.int32), np.empty(length, np.float32)
+    last = length // scale - 1
+    for x in range(length):
+        place = max((x + 0.5) / scale - 0.5, 0.0)
+        before[x] = min(int(place), last)
+        after[x] = min(before[x] + 1, last)
+        share[x] = place - before[x]
+    return before, after, share
 
-    Offsets ``(W / 2, 2)`` are interpolated between the middles of cells, which are two pixels wide: a quarter of the neighbour's on the
-    pixel's side and three quarters of the cell's own; ``near`` is the cell row of the pixels, ``far`` its neighbour.
-    """
-    own, next_to, zero = np.float32(0.75), np.float32(0.25), np.float32(0.0)
-    columns = near.shape[0]
-    for j in range(columns):
-        before, after = max(j - 1, 0), min(j + 1, columns - 1)
-        dx, dy = own * near[j, 0] + next_to * far[j, 0], own * near[j, 1] + next_to * far[j, 1]
+
+@njit(cache=True, nogil=True)
+def _said(weight, correction, row, out):
+    """Write a row of pixels of what a head says of cells: three corrections, then the logarithm of the weight."""
+    i, into = row // DETAIL, row % DETAIL * DETAIL
+    for j in range(weight.shape[1]):
         for half in range(DETAIL):
-            n = before if half == 0 else after
-            px = np.float32(DETAIL * j + half) + (own * dx + next_to * (own * near[n, 0] + next_to * far[n, 0]))
-            py = y + (own * dy + next_to * (own * near[n, 1] + next_to * far[n, 1]))
-            px, py = min(max(px, zero), right), min(max(py, zero), below)
-            x, whole_x, whole_y = DETAIL * j + half, np.int32(px), np.int32(py)
-            x0[x], y0[x] = whole_x, whole_y
-            fx[x], fy[x] = px - np.float32(whole_x), py - np.float32(whole_y)
+            for c in range(3):
+                out[DETAIL * j + half, c] = correction[i, j, 3 * (into + half) + c]
+            out[DETAIL * j + half, 3] = weight[i, j, into + half]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})

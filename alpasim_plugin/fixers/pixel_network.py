@@ -18,7 +18,6 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -30,8 +29,7 @@ from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, li
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
 from alpasim_plugin.nets.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
-from alpasim_plugin.nets.pixel_layers import cells, pixels
-from alpasim_plugin.nets.reference_blend import DETAIL, BesideCells, BlendHeads, gather_beside, mix, sources_of
+from alpasim_plugin.nets.reference_blend import BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -127,12 +125,11 @@ class GeneratorStep:
             warped = smaller(references.flatten(0, 1), scale).reshape(*references.shape[:2], *seen.shape[1:3], -1)
         noised = seen if source is render else smaller(source, scale)
         made = self.before_blend(seen, smaller(opacity, scale), smaller(sdmap, scale), past, noised, warped, t)
-        out, heads, recorded = made.repaired, made.heads, torch.zeros_like(render[..., :1])
+        out, recorded = made.repaired, torch.zeros_like(render[..., :1])
         if scale > 1:
             out = render + larger(made.repaired - seen, scale)
-            heads = None if heads is None else larger_heads(heads, scale)
-        if heads is not None and references is not None:
-            out, recorded = self.mix(out, references, heads)
+        if made.heads is not None and references is not None:
+            out, recorded = self.mix(out, references, made.heads, scale)
         return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
 
     def before_blend(
@@ -142,9 +139,9 @@ class GeneratorStep:
         beside = None if warped is None else gather_beside(warped, render)
         return self.net.before_blend(gather_cells(render, opacity, sdmap, past, source), render, past, t, beside)
 
-    def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
-        """Blend at full size; see `nets.reference_blend.mix`."""
-        return mix(sources_of(repaired, references, heads))
+    def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int) -> tuple[Tensor, Tensor]:
+        """Blend at full size; see `nets.reference_blend`."""
+        return mix(sources_of(repaired, references, heads, scale))
 
 
 class RecordedStep(GeneratorStep):
@@ -177,9 +174,9 @@ class RecordedStep(GeneratorStep):
         out, hidden, kept, frames, *heads = self.recorded.get(shape, self._step)(*tensors)
         return BeforeBlend(out, hidden, kept, frames, BlendHeads(*heads) if heads else None)
 
-    def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
+    def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int) -> tuple[Tensor, Tensor]:
         """Blend at full size in one compiled pass."""
-        return mix_cpu(repaired, references, heads)
+        return mix_cpu(repaired, references, heads, scale)
 
 
 def smaller(x: Tensor, scale: int) -> Tensor:
@@ -193,25 +190,15 @@ def smaller(x: Tensor, scale: int) -> Tensor:
 
 def larger(x: Tensor, scale: int) -> Tensor:
     """Enlarge pictures ``(B, H, W, C)`` bilinearly."""
-    if x.device.type != "cpu":
-        return F.interpolate(x.permute(0, 3, 1, 2), scale_factor=scale, mode="bilinear", align_corners=False).permute(0, 2, 3, 1)
-    return _resized(x, scale, cv2.INTER_LINEAR)
-
-
-def larger_heads(heads: BlendHeads, scale: int) -> BlendHeads:
-    """Return what a picture ``scale`` times as large is blended with: pixel by pixel for weights and corrections, offsets in its pixels."""
-    b, k = heads.weight.shape[:2]
-    weight, offset, correction = (part.flatten(0, 1) for part in heads)
-    fine = larger(torch.cat([pixels(weight, DETAIL), pixels(correction, DETAIL)], dim=-1), scale)
-    parts = cells(fine[..., :1], DETAIL), larger(offset, scale) * scale, cells(fine[..., 1:], DETAIL)
-    return BlendHeads(*(part.reshape(b, k, *part.shape[1:]) for part in parts))
+    return enlarged(x, scale) if x.device.type != "cpu" else _resized(x, scale, cv2.INTER_LINEAR)
 
 
 def _resized(x: Tensor, by: float, how: int) -> Tensor:
     """Resize by OpenCV, which is several times as fast as torch where channels come last."""
-    size = round(x.shape[2] * by), round(x.shape[1] * by)
-    images = [cv2.resize(one, size, interpolation=how).reshape(size[1], size[0], x.shape[3]) for one in x.contiguous().numpy()]
-    return torch.from_numpy(images[0][None] if len(images) == 1 else np.stack(images))
+    out = torch.empty(x.shape[0], round(x.shape[1] * by), round(x.shape[2] * by), x.shape[3])
+    for one, into in zip(x.contiguous().numpy(), out.numpy(), strict=True):
+        cv2.resize(one, into.shape[1::-1], dst=into, interpolation=how)
+    return out
 
 
 class _Step(nn.Module):

@@ -142,26 +142,35 @@ class Sources(NamedTuple):
     holds: Tensor  # (B, 1 + K, H, W, 1) where each holds, above 0 to 1
 
 
-def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads) -> Sources:
+def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1) -> Sources:
     """Return what the picture is blended of.
 
     Args:
         repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
         references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
-        heads: Of the same.
+        heads: Of the same, or of pictures ``scale`` times smaller; what they say is then interpolated, and offsets are as much longer.
+        scale: How many times.
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
-    moved = _sampled(references.flatten(0, 1), offset_px)
-    colour = (moved[..., :3] + pixels(correction, DETAIL)).view(b, k, h, w, 3)
+    weight, correction = (enlarged(pixels(part, DETAIL), scale) for part in (weight, correction))
+    moved = _sampled(references.flatten(0, 1), scale * offset_px)
+    colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
-    logit = (pixels(weight, DETAIL) + holds.log()).view(b, k, h, w, 1)
+    logit = (weight + holds.log()).view(b, k, h, w, 1)
     own = torch.zeros_like(logit[:, :1])
     return Sources(
         torch.cat([repaired[:, None], colour], dim=1),
         torch.cat([own, logit], dim=1),
         torch.cat([own + 1, holds.view(b, k, h, w, 1)], dim=1),
     )
+
+
+def enlarged(x: Tensor, scale: int) -> Tensor:
+    """Enlarge pictures ``(B, H, W, C)`` bilinearly, a whole number of times."""
+    if scale == 1:
+        return x
+    return F.interpolate(x.permute(0, 3, 1, 2), scale_factor=scale, mode="bilinear", align_corners=False).permute(0, 2, 3, 1)
 
 
 def mix(sources: Sources) -> tuple[Tensor, Tensor]:
@@ -194,9 +203,9 @@ def _added(each: Tensor, one: Tensor) -> Tensor:
 
 
 def _sampled(images: Tensor, offset: Tensor) -> Tensor:
-    """Look images ``(N, H, W, 4)`` up at offsets ``(N, H / 2, W / 2, 2)``, x and y in pixels; beyond the border the outermost go on."""
+    """Look images ``(N, H, W, 4)`` up at offsets in their pixels, x and y, of a coarser grid; beyond the border the outermost go on."""
     h, w = images.shape[1:3]
-    full = F.interpolate(offset.permute(0, 3, 1, 2), scale_factor=DETAIL, mode="bilinear", align_corners=False)
+    full = F.interpolate(offset.permute(0, 3, 1, 2), size=(h, w), mode="bilinear", align_corners=False)
     columns = torch.arange(w, device=images.device) + 0.5
     rows = torch.arange(h, device=images.device)[:, None] + 0.5
     grid = torch.stack([(columns + full[:, 0]) * (2 / w) - 1, (rows + full[:, 1]) * (2 / h) - 1], dim=-1)

@@ -50,18 +50,21 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
     assert torch.equal(fast.fine.nan_to_num(7.0), plain.fine.nan_to_num(7.0))
 
 
-@pytest.mark.parametrize(("batch", "references", "height", "width"), [(1, 1, 16, 16), (2, 3, 32, 48), (1, 4, 16, 80)])
-def test_one_pass_mixes_as_the_operations_one_by_one(batch: int, references: int, height: int, width: int) -> None:
+@pytest.mark.parametrize(
+    ("batch", "references", "height", "width", "scale"),
+    [(1, 1, 16, 16, 1), (2, 3, 32, 48, 1), (1, 4, 16, 80, 1), (2, 2, 32, 64, 2), (1, 1, 48, 96, 3), (1, 2, 16, 32, 8)],
+)
+def test_one_pass_mixes_as_the_operations_one_by_one(batch: int, references: int, height: int, width: int, scale: int) -> None:
     draw = torch.Generator().manual_seed(height + references)
     repaired = torch.rand(batch, height, width, 3, generator=draw) * 2 - 1
     images = torch.rand(batch, references, height, width, 4, generator=draw)
     images[..., :3] = images[..., :3] * 2 - 1
     images[..., 3] = (images[..., 3] * 3).floor() / 2  # 0, one half, 1
-    at2 = (batch, references, height // 2, width // 2)
+    at2 = (batch, references, height // (2 * scale), width // (2 * scale))
     heads = BlendHeads(*(torch.randn(*at2, n, generator=draw) * size for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))))
     for one, other in zip(gather_beside_cpu(images, repaired), gather_beside(images, repaired), strict=True):
         assert torch.allclose(one, other, atol=1e-6)
-    fast, plain = mix_cpu(repaired, images, heads), mix(sources_of(repaired, images, heads))
+    fast, plain = mix_cpu(repaired, images, heads, scale), mix(sources_of(repaired, images, heads, scale))
     assert torch.allclose(fast[0], plain[0], atol=2e-5)
     assert torch.allclose(fast[1], plain[1], atol=2e-5)
 

@@ -7,9 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep, larger_heads
+from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
-from alpasim_plugin.nets.reference_blend import BlendHeads, _sampled
+from alpasim_plugin.nets.reference_blend import _sampled
 
 SIZES = PixelSizes((16, 16, 16), blend=8)
 HEIGHT, WIDTH = 32, 64
@@ -101,17 +101,6 @@ def test_a_network_that_looks_at_smaller_pictures_blends_at_full_size(references
         small, _ = call(net, *seen, None)
         change = F.interpolate((small - seen[0]).permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
         assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
-
-
-def test_enlarged_heads_say_of_every_pixel_what_its_cell_said() -> None:
-    source = torch.Generator().manual_seed(3)
-    flat = [torch.rand(1, 2, 1, 1, n, generator=source).expand(-1, -1, 4, 6, -1) for n in (1, 2, 3)]
-    weight, offset, correction = flat
-    heads = BlendHeads(weight.repeat(1, 1, 1, 1, 4), offset.contiguous(), correction.repeat(1, 1, 1, 1, 4))
-    out = larger_heads(heads, 3)
-    assert torch.allclose(out.weight, weight[:, :, :1, :1].expand(-1, -1, 12, 18, 4))
-    assert torch.allclose(out.offset_px, 3 * offset[:, :, :1, :1].expand(-1, -1, 12, 18, 2))
-    assert torch.allclose(out.correction, correction[:, :, :1, :1].repeat(1, 1, 12, 18, 4))
 
 
 def test_sizes_with_a_blending_head_are_read_off_the_tensors() -> None:
