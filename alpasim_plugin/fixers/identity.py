@@ -1,4 +1,4 @@
-"""Fixers that are known without loading a network: the one that fixes nothing, for wiring and timing, and the per-frame generators' factory."""
+"""Fixers that are known without loading a network: the one that fixes nothing, and the factory of the per-frame generators."""
 
 from __future__ import annotations
 
