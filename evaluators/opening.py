@@ -25,8 +25,13 @@ class Run(reader.Run):
         return cls(run.folder, run.info, run.summary, run.rollouts, run.metric_names)
 
 
-def read_run(run_dir: Path | str) -> Run:
-    """Read a run folder, whose rates must lie in [0, 1]; see `alpasim_plugin.run_folder.reader.read_run`."""
+def read_run(run_dir: Path | str | Run) -> Run:
+    """Read a run folder, whose rates must lie in [0, 1]; see `alpasim_plugin.run_folder.reader.read_run`.
+
+    A run that was read is returned as it is.
+    """
+    if isinstance(run_dir, Run):
+        return run_dir
     run = Run.of(reader.read_run(run_dir))
     ROLLOUTS_TABLE.check(run.folder / ROLLOUTS, rates=run.table.rates)
     return run

@@ -37,11 +37,10 @@ from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.scene.builder import placed_cloud
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import C0
 from alpasim_plugin.process.signals import Stopped

@@ -11,9 +11,11 @@ import difflib
 import errno
 import json
 import os
+import re
 import select
 import sys
 import traceback
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -263,9 +265,21 @@ def _complete() -> None:
     make_app(verb if number > 1 or verb == "run" else None)(prog_name="simrun")
 
 
+def load_workers_early(args: Sequence[str]) -> None:
+    """Let what rollouts need be loaded beside this process, if it is about to have some driven by workers of this machine."""
+    is_run = bool(args) and (args[0] == "run" or args[0] not in verbs())
+    if is_run and not re.search(r"--(help|version|dry-run|executor|workers[= ]1\b)", " ".join(args)) and (os.cpu_count() or 1) > 1:
+        from alpasim_plugin.runtime.executors.local import load_early
+
+        load_early()
+
+
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
+    if "_SIMRUN_COMPLETE" not in os.environ:
+        with contextlib.suppress(SimrunError):  # it is raised again where errors are printed
+            load_workers_early(sys.argv[1:])
     if "_SIMRUN_COMPLETE" in os.environ:
         _complete()
     sys.exit(run_command(sys.argv[1:]))

@@ -21,7 +21,7 @@ from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.run_folder.manifests import read_run_json
 from alpasim_plugin.run_folder.schema import OUTPUT_NAME
-from alpasim_plugin.runtime.certificate import certificate_line
+from alpasim_plugin.runtime.certificate import certificate_line, foreseen
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
@@ -74,7 +74,8 @@ def run(
         base_named(options.baseline, arms, "choosing a baseline", "the run")
     root = out or default_folder(plan)
     if dry_run:
-        _print_plan(plan, root, thread_budget(where.workers, len(plan.cells), how["executor"]), as_json)
+        repeats = foreseen(plan, care.certify) is not None
+        _print_plan(plan, root, thread_budget(where.workers, len(plan.cells), how["executor"], repeats), as_json)
         return
     progress, command = make_progress(quiet or as_json), ["simrun", *sys.argv[1:]]
     try:

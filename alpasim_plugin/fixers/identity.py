@@ -1,12 +1,18 @@
-"""The fixer that fixes nothing: closed-loop wiring and timing without a network."""
+"""Fixers that are known without loading a network: the one that fixes nothing, and the factory of the per-frame generators."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.fixers.bundle import FixerFactory
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
+
+if TYPE_CHECKING:
+    from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 
 
 class IdentityFixer(Fixer):
@@ -42,3 +48,12 @@ class IdentityFixer(Fixer):
         out = self.preview(block, maps)
         self._done += 1
         return out
+
+
+def _session(settings: PixelFixerSettings, scene_id: str, seed: int, device: str, threads: int | None) -> PixelFixer:
+    from alpasim_plugin.fixers.pixel_fixer import PixelFixer  # loads torch
+
+    return PixelFixer(settings, scene_id, seed, device, threads)
+
+
+per_frame = FixerFactory(PixelFixerSettings, _session)

@@ -314,3 +314,11 @@ def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
         cause = f"colour harmonics beyond {kept} coefficients left out"
         report = replace(report, repaired={**report.repaired, cause: len(cloud)})
     return cloud, report
+
+
+def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
+    """Move a cloud by a similarity transform; its colours turn with it."""
+    scale = float(np.cbrt(np.linalg.det(T_world_file[:3, :3])))
+    rigid = np.asarray(T_world_file, dtype=np.float64).copy()
+    rigid[:3, :3] /= scale
+    return replace(cloud, means=cloud.means * scale, scales=cloud.scales * scale).transformed(rigid)

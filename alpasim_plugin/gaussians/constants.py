@@ -43,6 +43,11 @@ GEO_SIZE = 12
 BUNDLE = 256
 SPHERE_SIZE = 5
 
+# One prepared cloud among those of a frame, one int64 row: addresses of its arrays, and numbers.
+PART_MEANS, PART_GEOMETRY, PART_SH, PART_INDEX, PART_SPHERES, PART_SPHERE = 0, 1, 2, 3, 4, 5
+PART_GROUPS, PART_SH_SIZE, PART_INPUT = 6, 7, 8
+PART_SIZE = 9
+
 # One visible splat: sixteen float32, one cache line. With d = pixel - (u, v) the exponent is s^2 + t^2 where s = L11 dx + L12 dy and
 # t = L22 dy: a sum of squares, which keeps its precision for needles where the usual quadratic form cancels.
 U, V = 0, 1

@@ -12,9 +12,8 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, BackgroundFile, Scenario
-from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files import read_gaussians
-from alpasim_plugin.gaussians.scene.builder import placed_cloud
 
 NEAR_M, BELOW_M, ABOVE_M = 10.0, 5.0, 15.0  # a Gaussian is near a point of the path: in plan view, and in height
 FEWEST = 20  # Gaussians near a point of the path for it to count as covered

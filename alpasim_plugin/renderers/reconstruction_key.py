@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,12 +15,14 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.scene.log_views import SkyView
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.io.reading import read_json_as
 from alpasim_plugin.plugins.parts.source import own_code_digest
+
+if TYPE_CHECKING:
+    from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+    from alpasim_plugin.gaussians.scene.log_views import SkyView
 
 # By second of the log and camera, so that a longer drive is fitted no worse.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
@@ -203,6 +205,8 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
     Raises:
         InputError: A file is missing or is another one than was written.
     """
+    from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction  # it loads the rasteriser, which a key needs not
+
     hashes = read_json_as(dict[str, str], folder / HASHES, DOING, do_this=DO_THIS)
     there = set(_files(folder)) - {HASHES}
     odd = sorted(there ^ set(hashes))
@@ -220,6 +224,8 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
 
 
 def _read_sky_views(path: Path) -> list[SkyView]:
+    from alpasim_plugin.gaussians.scene.log_views import SkyView
+
     try:
         with np.load(path, allow_pickle=False) as file:
             sizes, Ks, Ts, bits = file["size"], file["K"], file["T_camera_world"], file["sky"]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,21 +24,66 @@ from alpasim_plugin.runtime.plan import Cell, RunPlan
 Certify = Literal["none", "one"]
 
 
-def certify(
-    plan: RunPlan, root: Path, manifests: Sequence[dict[str, Any]], threads: int, mode: Certify, before: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Repeat one rollout of a finished run and return the certificate.
+@dataclass
+class Repeat:
+    """A rollout that is driven twice, the second time beside other rollouts where there are workers.
 
-    The rollout with the fewest control steps is repeated, of several the one with the smallest content key: the choice depends on the plan
-    alone. The repeat runs in this process, whatever the number of workers of the run.
+    Attributes:
+        cell: Which; None: none.
+        root: Where the second drive is written, as below a run folder.
+        manifest: Of the second drive; None: it was not driven yet, or its worker died.
+    """
+
+    cell: Cell | None
+    root: Path
+    manifest: dict[str, Any] | None = None
+
+
+@contextmanager
+def repeating(plan: RunPlan, root: Path, mode: Certify) -> Iterator[Repeat]:
+    """Yield what is to be repeated of a plan; the second drive is removed when the block ends."""
+    # In the run folder, under a name that the next run removes if this process is killed.
+    with scratch_folder(root / "repeat", "repeating a rollout") as scratch:
+        yield Repeat(foreseen(plan, mode), scratch)
+
+
+def foreseen(plan: RunPlan, mode: Certify) -> Cell | None:
+    """Return which rollout of a plan may be repeated beside the others; None: none, or one of services, which may take one at a time."""
+    cell = None if mode == "none" else chosen_of(plan, plan.cells)
+    return None if cell is None or cell.undigested else cell
+
+
+def chosen_of(plan: RunPlan, cells: Iterable[Cell]) -> Cell | None:
+    """Return which of some rollouts is repeated; None where none can be: the shortest, of several that with the smallest content key."""
+
+    def order(cell: Cell) -> tuple[int, str]:
+        scenario = plan.scenarios[cell.scene]
+        return scenario.end_us - scenario.start_us, cell.rollout_key
+
+    return min((cell for cell in cells if plan.scenarios[cell.scene].latency.kind != "measured"), key=order, default=None)
+
+
+def certify(
+    plan: RunPlan,
+    root: Path,
+    manifests: Sequence[dict[str, Any]],
+    threads: int,
+    mode: Certify,
+    before: Mapping[str, Any] | None = None,
+    repeat: Repeat | None = None,
+) -> dict[str, Any]:
+    """Compare a rollout of a finished run with its repeat, and return the certificate.
+
+    The rollout is `chosen_of` those that finished.
 
     Args:
         plan: The run.
         root: Its folder.
         manifests: One per cell, in the plan's order.
-        threads: Threads of the repeat; results must not depend on them.
+        threads: Threads of a repeat in this process; results must not depend on them.
         mode: "none" makes no repeat.
         before: The folder's earlier certificate; it is kept if it certifies the same rollout and the same log.
+        repeat: What was repeated beside the others. Where it is another rollout, the repeat runs now, in this process.
 
     Returns:
         ``status`` (equal, different, skipped), ``reason`` where skipped, ``error`` (its four parts) where the repeat failed, ``cell``,
@@ -46,11 +93,11 @@ def certify(
     if mode == "none":
         return {"status": "skipped", "reason": "switched off with --certify none"}
     done = [(cell, m) for cell, m in zip(plan.cells, manifests, strict=True) if m["status"] == "ok"]
-    repeatable = [(cell, m) for cell, m in done if plan.scenarios[cell.scene].latency.kind != "measured"]
-    if not repeatable:
+    cell = chosen_of(plan, (cell for cell, _ in done))
+    if cell is None:
         why = "latency 'measured' depends on the machine: no rollout can be repeated" if done else "no rollout finished"
         return {"status": "skipped", "reason": why}
-    cell, manifest = min(repeatable, key=lambda pair: (pair[1]["steps"], pair[0].rollout_key))
+    manifest = next(m for one, m in done if one is cell)
     log_sha256 = sha256((root / cell.folder / LOG_NAME).read_bytes())
     facts = {
         "cell": dict(cell.names),
@@ -64,10 +111,15 @@ def certify(
         return dict(before)
     began = time.perf_counter()
     try:
-        found = _repeat(plan, cell, root, manifest, threads, log_sha256)
+        with repeating(plan, root, mode) as late:
+            again = repeat if repeat is not None and repeat.cell is cell and repeat.manifest is not None else late
+            took_s = 0.0 if again.manifest is None else again.manifest["wall_s"]
+            again.manifest = again.manifest or run_cell(cell, plan.options, late.root, threads)
+            found = _compared(plan, cell, root, manifest, again.root, again.manifest, log_sha256)
     except SimrunError as error:  # the run is driven and scored: its tables and reports must not be lost with the repeat
         found = _skipped(error.as_dict())
-    return facts | found | {"wall_s": round(time.perf_counter() - began, 3)}
+        took_s = 0.0
+    return facts | found | {"wall_s": round(took_s + time.perf_counter() - began, 3)}
 
 
 def certificate_line(certificate: Mapping[str, Any]) -> str:
@@ -86,14 +138,13 @@ def certificate_line(certificate: Mapping[str, Any]) -> str:
     return f"DIFFERENT: {certificate['path']}, first in {first['component']}{at} ({first['what']})"
 
 
-def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], threads: int, log_sha256: str) -> dict[str, Any]:
-    # In the run folder, under a name that the next run removes if this process is killed.
-    with scratch_folder(root / "repeat", "repeating a rollout") as scratch:
-        again = run_cell(cell, plan.options, scratch, threads)
-        if again["status"] != "ok":
-            return _not_repeated(again["error"])
-        one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(scratch / cell.folder, again)
-        same_bytes = sha256((scratch / cell.folder / LOG_NAME).read_bytes()) == log_sha256
+def _compared(
+    plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], again_root: Path, again: Mapping[str, Any], log_sha256: str
+) -> dict[str, Any]:
+    if again["status"] != "ok":
+        return _not_repeated(again["error"])
+    one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(again_root / cell.folder, again)
+    same_bytes = sha256((again_root / cell.folder / LOG_NAME).read_bytes()) == log_sha256
     scenario = plan.scenarios[cell.scene]
     difference = first_difference(one, other, scenario.start_us, scenario.rates.control_us)
     first = None if difference is None else difference.as_dict()

@@ -23,6 +23,7 @@ from alpasim_plugin.plugins import kernels
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.run_folder.manifests import write_manifest
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.certificate import Repeat
 from alpasim_plugin.runtime.commits import KnownCommits, opened, run_stored_cell, unpack
 from alpasim_plugin.runtime.executors.assignment import assignment_as_here, measured_folder, targets_of
 from alpasim_plugin.runtime.executors.base import Lost
@@ -46,12 +47,17 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
     """
     if workers < 2:
         return
-    cold = [one for one in needed(todo, scenarios) if not kernels.covers(one) and not (cache_root() / KERNELS / _key(one)).exists()]
+    cold = [one for one in needed(todo, scenarios) if is_cold(one)]
     if not cold:
         return
     for subject, got in run_in_processes(compile_kernels, cold, min(workers, len(cold)), 1):
         if isinstance(got, Lost):
             print(f"warning: compiling {subject} kernels: {got.found}; the rollouts compile them", file=sys.stderr, flush=True)
+
+
+def is_cold(subject: str) -> bool:
+    """Tell whether the kernels of a subject are still to be compiled."""
+    return not kernels.covers(subject) and not (cache_root() / KERNELS / _key(subject)).exists()
 
 
 def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:
@@ -93,18 +99,19 @@ class Threads:
     per_worker: int
 
 
-def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL) -> Threads:
+def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL, repeats: bool = False) -> Threads:
     """Divide the cores that this process may use among the workers; those of other nodes have the cores that the executor asks for.
 
     Args:
         workers: Number of workers; None is one per core. Never more than cells. On other nodes it is the most, and None is no bound.
         n_cells: Number of cells to run.
         executor: Where rollouts run.
+        repeats: A worker of this machine drives one of them again.
     """
     if not executor.is_local:
         return Threads(max(1, min(workers or n_cells, n_cells)), executor.resources.cores)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    chosen = max(1, min(workers or cores, max(n_cells, 1)))
+    chosen = max(1, min(workers or cores, max(n_cells, 1) + repeats))
     return Threads(chosen, max(1, cores // chosen))
 
 
@@ -145,7 +152,13 @@ class HowToRun:
 
 
 def execute(
-    plan: RunPlan, root: Path, how: HowToRun, on_done: OnDone, notify: Callable[[str], None], known: Collection[str] = ()
+    plan: RunPlan,
+    root: Path,
+    how: HowToRun,
+    on_done: OnDone,
+    notify: Callable[[str], None],
+    known: Collection[str] = (),
+    repeat: Repeat | None = None,
 ) -> list[dict[str, Any]]:
     """Run every unfinished cell and return all manifests in the plan's order.
 
@@ -159,6 +172,7 @@ def execute(
         on_done: Called with each manifest.
         notify: Called with one line for each damaged rollout.
         known: Folders of rollouts that were finished once.
+        repeat: Driven again beside the others, if workers of this machine drive it now.
     """
     share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
@@ -180,8 +194,11 @@ def execute(
             manifest = state.manifest if action == "none" else rescore_cell(cell, plan.options, root, state.manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
-    runner = _run_local if how.executor.is_local else _run_elsewhere
-    for cell, manifest in runner(todo, plan, root, how, store, notify):
+    if how.executor.is_local:
+        driven = _run_local(todo, plan, root, how, store, repeat)
+    else:
+        driven = _run_elsewhere(todo, plan, root, how, store, notify)
+    for cell, manifest in driven:
         manifest = _scored(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, False)
@@ -202,29 +219,45 @@ def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any
 Done = Iterator[tuple[Cell, dict[str, Any]]]
 
 
-def _run_local(
-    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, notify: Callable[[str], None]
-) -> Done:
+def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, repeat: Repeat | None) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
     if how.threads.workers > 1 or how.limit_s is not None:
         compile_for(todo, plan.scenarios, how.threads.workers)
     threads = how.threads.per_worker
-    work: Callable[[Cell], dict[str, Any]] = partial(run_cell, options=plan.options, root=root, threads=threads)
+    drive: Callable[..., dict[str, Any]] = partial(run_cell, options=plan.options, threads=threads)
+    work: Callable[..., dict[str, Any]] = drive
     if how.store is not None and store is not None:
-        work = partial(run_stored_cell, options=plan.options, root=root, threads=threads, store=how.store, fresh=store.fresh)
+        work = partial(run_stored_cell, options=plan.options, threads=threads, store=how.store, fresh=store.fresh)
+    jobs = [_Job(cell, root, work) for cell in todo]
+    if how.threads.workers > 1:
+        if repeat is not None and repeat.cell is not None and repeat.cell in todo:
+            jobs.append(_Job(repeat.cell, repeat.root, drive))
+        jobs.sort(key=lambda job: job.cell.renderer.fixer is None)  # what takes longest comes first, so that all workers end together
 
-    def known(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
-        action, state = find_rollout_state(cell, root, reuse_undigested=True)
+    def known(job: _Job) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
+        action, state = find_rollout_state(job.cell, job.root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for cell, got in run_or_retry(partial(_of_run, how.run, work), todo, how.threads.workers, threads, how.limit_s, known):
-        yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
+    for job, got in run_or_retry(partial(_of_run, how.run), jobs, how.threads.workers, threads, how.limit_s, known):
+        if repeat is not None and job.root is repeat.root:
+            repeat.manifest = None if isinstance(got, Lost) else got
+        else:
+            yield job.cell, _lost(job.cell, root, got) if isinstance(got, Lost) else got
 
 
-def _of_run(run: str, work: Callable[[Cell], dict[str, Any]], cell: Cell) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Job:
+    """One rollout for a worker of this machine: where it is written, and by what it is driven."""
+
+    cell: Cell
+    root: Path
+    work: Callable[..., dict[str, Any]]
+
+
+def _of_run(run: str, job: _Job) -> dict[str, Any]:
     """Run a cell in a worker of this machine."""
     share_measurements(measured_folder(run))
-    return work(cell)
+    return job.work(job.cell, root=job.root)
 
 
 def _run_elsewhere(

@@ -19,7 +19,7 @@ from alpasim_plugin.viewer.page import write_flips_page
 from alpasim_plugin.viewer.pictures import smaller
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report import write_junit, write_report, write_summary_md
 from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips, key_of_entry
 
@@ -33,15 +33,16 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
         page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an earlier command are removed, and None is
             returned.
     """
+    run = read_run(root)
     replays: Mapping[FlipKey, str] = {}
     if flips and page:
-        write_flips(root)
-        replays = write_flips_page(root)
-        write_causes(root)
-    write_summary_md(root)
-    write_junit(root)
+        write_flips(run)
+        replays = write_flips_page(run)
+        write_causes(run)
+    write_summary_md(run)
+    write_junit(run)
     if page:
-        return write_report(root, replays)
+        return write_report(run, replays)
     for name in PAGES:
         (root / name).unlink(missing_ok=True)
     return None
@@ -50,14 +51,9 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
 MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any other
 
 
-def write_causes(root: Path) -> None:
-    """Write the page of a cause for the first drives that failed, one a scene and arm; those of `simrun why` are kept.
-
-    Raises:
-        InputError: The run folder is not complete enough to be read.
-    """
-    run = read_run(root)
-    told = read_json(root / FLIPS_NAME)["cells"]
+def write_causes(run: Run) -> None:
+    """Write the page of a cause for the first drives that failed, one a scene and arm; those of `simrun why` are kept."""
+    told = read_json(run.folder / FLIPS_NAME)["cells"]
     failed = {one.cell[:3]: one for one in reversed(run.rollouts) if one.ok and outcomes_of(one)}
     for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
         if run.file_of(rollout, WHY_NAME) is None:
@@ -71,7 +67,7 @@ MAX_FLIPS = 60  # cells whose logs are read
 PICTURE_WIDTH = 560
 
 
-def write_flips(root: Path) -> Path:
+def write_flips(run_dir: Path | Run) -> Path:
     """Find the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
 
     A probe of the same cell and renderers is used where it exists: it renders both at identical poses. Otherwise the two logs are compared;
@@ -80,7 +76,8 @@ def write_flips(root: Path) -> Path:
     Raises:
         InputError: The run folder is not complete enough to be read.
     """
-    run = read_run(root)
+    run = read_run(run_dir)
+    root = run.folder
     flips, compared = find_flips(run)
     cells = []
     for number, flip in enumerate(flips[:MAX_FLIPS]):

@@ -29,7 +29,7 @@ from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.schema import CONTENTS, REPORTS, RUN_INFO, SUMMARY, TABLES, slug
 from alpasim_plugin.run_folder.writer import write_scene, writing
 from alpasim_plugin.runtime.cell import find_rollout_state
-from alpasim_plugin.runtime.certificate import Certify, certify
+from alpasim_plugin.runtime.certificate import Certify, certify, foreseen, repeating
 from alpasim_plugin.runtime.commits import opened
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
@@ -136,7 +136,7 @@ def execute_run(
         InputError: The folder holds the run of another command and ``resume`` is not set.
         InfrastructureError: Another process writes the folder, or it is read-only and the run is not finished.
     """
-    threads = thread_budget(workers, len(plan.cells), executor)
+    threads = thread_budget(workers, len(plan.cells), executor, foreseen(plan, certificate) is not None)
     if root.exists() and not os.access(root, os.W_OK):
         return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
@@ -146,9 +146,11 @@ def execute_run(
         began = time.perf_counter()
         how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
         try:
-            manifests = execute(plan, root, how, on_done(progress), progress.noticed, contents.rollouts if contents else ())
-            pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
-            determinism = certify(plan, root, manifests, how.cores_here, certificate, held.get("determinism"))
+            with repeating(plan, root, certificate) as repeat:
+                known = contents.rollouts if contents else ()
+                manifests = execute(plan, root, how, on_done(progress), progress.noticed, known, repeat)
+                pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
+                determinism = certify(plan, root, manifests, how.cores_here, certificate, held.get("determinism"), repeat)
         finally:
             end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)

@@ -266,7 +266,7 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
 
 
-def write_flips_page(root: Path) -> Mapping[FlipKey, str]:
+def write_flips_page(run_dir: Path | Run) -> Mapping[FlipKey, str]:
     """Write ``flips.html`` of a run folder: its changed outcomes alone, small. Without any, one of an earlier command is removed.
 
     Returns:
@@ -275,14 +275,14 @@ def write_flips_page(root: Path) -> Mapping[FlipKey, str]:
     Raises:
         InputError: The run folder is not complete enough to be read.
     """
-    run = read_run(root)
+    run = read_run(run_dir)
     flipped = telling(cells_of(run, arms=True))
     if not flipped:
-        (root / FLIPS_PAGE).unlink(missing_ok=True)
+        (run.folder / FLIPS_PAGE).unlink(missing_ok=True)
         return {}
     with reporting(run):
         page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
-    write_text(root / FLIPS_PAGE, page.html, DOING)
+    write_text(run.folder / FLIPS_PAGE, page.html, DOING)
     return {flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}" for cell in page.cells for flip in cell.flips}
 
 

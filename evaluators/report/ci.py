@@ -36,7 +36,7 @@ MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "policy
 INTERVAL_NOTE = "a to b is the 95 % interval with scenes as clusters."
 
 
-def write_summary_md(run_dir: Path | str) -> Path:
+def write_summary_md(run_dir: Path | str | Run) -> Path:
     """Write ``summary.md`` into a run folder and return its path.
 
     Raises:
@@ -130,7 +130,7 @@ def cell_text(cell: Cell) -> str:
     return f"{cell.text}, {cell.detail}" if cell.detail else cell.text
 
 
-def write_junit(run_dir: Path | str) -> Path:
+def write_junit(run_dir: Path | str | Run) -> Path:
     """Write ``junit.xml`` into a run folder and return its path.
 
     Raises:

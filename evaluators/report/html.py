@@ -59,11 +59,11 @@ DOING_SHOT = "reading a picture of a run"
 NO_REPLAYS: Mapping[FlipKey, str] = {}
 
 
-def write_report(run_dir: Path | str, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> Path:
+def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> Path:
     """Write ``report.html`` into a run folder.
 
     Args:
-        run_dir: A run folder (docs/architecture.md). Nothing else is read.
+        run_dir: A run folder (docs/architecture.md), or what was read of it. Nothing else is read.
         replays: Key of a changed outcome -> where it is replayed, relative to the run folder.
 
     Returns:

@@ -10,8 +10,9 @@ import pytest
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.types import Environment, LaneMap, Route, Scenario, Trajectory
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import placed_cloud
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
-from alpasim_plugin.gaussians.scene.builder import build_scene, placed_cloud, with_background
+from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.site import contours, make_site
 from alpasim_plugin.world.ground import height_at

@@ -11,9 +11,8 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files.ply import write_ply
-from alpasim_plugin.gaussians.scene.builder import placed_cloud
 from alpasim_plugin.renderers.background import coverage_of, suggested_transform
 from scenarios.load import load_scenario
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import threading
 
 import numpy as np
@@ -75,6 +76,32 @@ def test_culling_bundles_and_nodes_never_changes_the_image():
         whole = rasterize_reference(scene, cam)
         assert_same_image(out, whole, 5e-5, odd_share=1e-3)
         assert out.stats["gaussians"] == 3000
+
+
+def test_many_parts_of_all_kinds_in_one_call_equal_the_reference_and_their_copies_from_another_process():
+    """Empty ones, single splats, several bundles, every degree of colours, both colour frames, at rest and moved, in view and behind."""
+    rng, nodes, clouds = np.random.default_rng(5), [], []
+    for i in range(90):
+        n, degree = int(rng.choice([0, 1, 17, 40, 300])), int(rng.integers(0, 4))
+        cloud = small_object(i, n) if n else GaussianCloud.empty()
+        cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities * rng.uniform(), cloud.sh[:, : (degree + 1) ** 2])
+        T = None if i % 3 == 0 else random_rigid(i, 3.0)
+        if T is not None:
+            T[2, 3] += 4.0
+        sh_frame = "object" if i % 2 else "world"
+        nodes.append((prepare(cloud, sh_frame=sh_frame), T))
+        clouds.append(cloud if T is None else cloud.transformed(T, rotate_colour=sh_frame == "object"))
+    found = rasterize_prepared(nodes, camera(), threads=1)
+    size = max(cloud.sh.shape[1] for cloud in clouds)
+    whole = GaussianCloud.concatenate(
+        [GaussianCloud(c.means, c.quats, c.scales, c.opacities, np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0)))) for c in clouds]
+    )
+    assert_same_image(found, rasterize_reference(whole, camera()), 3e-5, odd_share=5e-4)
+    sent = pickle.loads(pickle.dumps(nodes))
+    for again in (rasterize_prepared(nodes, camera(), threads=3), rasterize_prepared(sent, camera(), threads=1)):
+        assert np.array_equal(found.rgb, again.rgb)
+        assert np.array_equal(found.depth, again.depth)
+        assert found.stats == again.stats
 
 
 def test_a_node_out_of_view_costs_nothing_and_one_in_view_is_kept():

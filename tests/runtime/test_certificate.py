@@ -53,6 +53,17 @@ def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Pat
     assert "smoke-straight" in certificate_line(found)
 
 
+def test_workers_drive_the_repeat_beside_the_other_rollouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of()
+    one = execute_run(plan, tmp_path / "one", 1, ["simrun"], Announced(), report=False).summary["determinism"]
+    monkeypatch.setattr("alpasim_plugin.runtime.certificate.run_cell", None)  # in this process
+    two = execute_run(plan, tmp_path / "two", 2, ["simrun"], Announced(), report=False).summary["determinism"]
+    assert one.pop("wall_s") > 0
+    assert two.pop("wall_s") > 0
+    assert one == two
+    assert not list((tmp_path / "two").glob("*repeat*"))
+
+
 class Flicker(CleanRenderer):
     """Changes one pixel of the fourth frame of every rollout after the process's first."""
 

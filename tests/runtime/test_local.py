@@ -48,6 +48,31 @@ def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not() -> No
     assert found["hangs"] == Lost("it did not finish within 0.5 s", hung=True)
 
 
+LOAD = "from alpasim_plugin.process.subprocesses import load_for_copies; load_for_copies(['colorsys'])"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks")
+def test_copies_answer_as_fresh_workers_do_and_have_what_was_loaded(repo: Path) -> None:
+    """And they import nothing from the working directory, without a variable that would keep a user's own command from it."""
+    code = (
+        "import os, sys\n"
+        "from alpasim_plugin.runtime.executors.local import run_in_processes\n"
+        "from tests.runtime.test_local import loaded, work\n"
+        f"{LOAD}\n"
+        "found = dict(run_in_processes(work, ['a', 'dies', 'leaves', 'b'], 2, 1))\n"
+        "print([getattr(found[item], 'found', found[item]) for item in ('a', 'dies', 'leaves', 'b')])\n"
+        "print([got for _, got in run_in_processes(loaded, ['colorsys'], 1, 1)], 'colorsys' in sys.modules)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(repo)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    ended = "'its worker process ended (killed by SIGKILL)', 'its worker process ended (exit code 3)'"
+    assert done.stdout == f"['A', {ended}, 'B']\n[(True, None)] False\n"
+
+
+def loaded(module: str) -> tuple[bool, str | None]:
+    return module in sys.modules, os.environ.get("PYTHONSAFEPATH")
+
+
 @pytest.mark.slow
 def test_what_lost_its_worker_runs_once_more_after_all_others(tmp_path: Path) -> None:
     once = f"dies once {tmp_path / 'seen'}"
@@ -82,7 +107,8 @@ def test_an_error_ends_the_work_and_reaches_the_parent(item: str, error: str) ->
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-def test_workers_end_when_their_parent_is_killed(tmp_path: Path, repo: Path) -> None:
+@pytest.mark.parametrize("copies", [False, True])
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path, repo: Path, copies: bool) -> None:
     (tmp_path / "driver.py").write_text(
         "import os, time\n"
         "from pathlib import Path\n"
@@ -91,6 +117,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, repo: Path) -> 
         "    Path(folder, str(os.getpid())).touch()\n"
         "    time.sleep(60)\n"
         "if __name__ == '__main__':\n"
+        f"    {LOAD if copies else 'pass'}\n"
         f"    list(run_in_processes(work, [{str(tmp_path / 'pids')!r}] * 2, 2, 1))\n"
     )
     (tmp_path / "pids").mkdir()

@@ -33,6 +33,14 @@ from alpasim_plugin.gaussians.constants import (
     L11,
     L12,
     L22,
+    PART_GEOMETRY,
+    PART_GROUPS,
+    PART_INDEX,
+    PART_MEANS,
+    PART_SH,
+    PART_SH_SIZE,
+    PART_SPHERE,
+    PART_SPHERES,
     PEAK,
     POSE_CENTRE,
     POSE_COLOUR,
@@ -115,15 +123,13 @@ def colours_in_lanes(coefficients, width, index, out):
 
 
 @njit(cache=True, nogil=True)
-def nodes_in_view(spheres, poses, camera):
-    """Return the positions of the nodes that may touch a pixel."""
-    kept = np.empty(spheres.shape[0], np.int64)
-    count = 0
-    for i in range(spheres.shape[0]):
-        if not bundle_is_out_of_view(spheres[i], np.int64(0), poses[i], camera):
-            kept[count] = i
-            count += 1
-    return kept[:count]
+def bundles_in_view(parts, poses, camera):
+    """Return where each part's bundles begin in the row of all that are looked at, and where the last end; none of a part out of view."""
+    first = np.zeros(parts.shape[0] + 1, np.int64)
+    for i in range(parts.shape[0]):
+        seen = not bundle_is_out_of_view(v.array_at(parts[i, PART_SPHERE], np.float64), np.int64(0), poses[i], camera)
+        first[i + 1] = first[i] + ((parts[i, PART_GROUPS] * 16 + BUNDLE - 1) // BUNDLE if seen else 0)
+    return first
 
 
 @njit(cache=True, nogil=True)
@@ -294,20 +300,16 @@ def _colour_group(group, d, sh, sh_size, pose, basis, lanes):
 
 
 @njit(cache=True, nogil=True)
-def project_node(cursor, means, geometry, sh, sh_size, index, spheres, first_id, pose, camera, records, ids):
-    """Project one node's Gaussians and append those that reach the image; called by each thread until no bundle is left.
+def project_parts(cursor, parts, first_bundles, first_ids, poses, camera, records, ids):
+    """Project the Gaussians of all parts and append those that reach the image; called by each thread until no bundle is left.
 
     Args:
         cursor: int64 ``(2,)``: the next bundle, the number of records written; shared by all threads.
-        means: float64, groups of 3 x 16.
-        geometry: float32, groups of GEO_SIZE x 16.
-        sh: float32, groups of sh_size x 3 x 16.
-        sh_size: Coefficients per colour.
-        index: int64, position of each lane's Gaussian in the cloud.
-        spheres: float64, SPHERE_SIZE per bundle.
-        first_id: Added to ``index``; makes identities unique over nodes and ordered by node.
-        pose: See layout.
-        camera: See layout.
+        parts: int64 ``(N, PART_SIZE)``, see `constants`.
+        first_bundles: int64 ``(N + 1,)``, from `bundles_in_view`.
+        first_ids: int64 ``(N,)``, added to a Gaussian's position in its cloud; makes identities unique and ordered by part.
+        poses: float64 ``(N, POSE_SIZE)``, see `constants`.
+        camera: See `constants`.
         records: float32 output, RECORD per splat.
         ids: int64 output, one per splat.
     """
@@ -315,27 +317,35 @@ def project_node(cursor, means, geometry, sh, sh_size, index, spheres, first_id,
     basis = np.empty(16 * 16, np.float32)
     kept = np.empty(BUNDLE * RECORD, np.float32)
     kept_ids = np.empty(BUNDLE, np.int64)
-    n_groups = index.shape[0] // 16
-    n_bundles = (n_groups * 16 + BUNDLE - 1) // BUNDLE
+    i, end = -1, 0  # the part in hand, and the first bundle behind it
     while True:
         bundle = v.fetch_add(cursor, 0, 1)
-        if bundle >= n_bundles:
+        if bundle >= first_bundles[parts.shape[0]]:
             return
-        if bundle_is_out_of_view(spheres, bundle * SPHERE_SIZE, pose, camera):
+        if bundle >= end:  # bundles come in ascending order
+            i += 1
+            while first_bundles[i + 1] <= bundle:
+                i += 1
+            end, pose, sh_size = first_bundles[i + 1], poses[i], parts[i, PART_SH_SIZE]
+            means, spheres = v.array_at(parts[i, PART_MEANS], np.float64), v.array_at(parts[i, PART_SPHERES], np.float64)
+            geometry, sh = v.array_at(parts[i, PART_GEOMETRY], np.float32), v.array_at(parts[i, PART_SH], np.float32)
+            index = v.array_at(parts[i, PART_INDEX], np.int64)
+        at = bundle - first_bundles[i]
+        if bundle_is_out_of_view(spheres, at * SPHERE_SIZE, pose, camera):
             continue
         count = 0
-        first = bundle * (BUNDLE // 16)
-        for group in range(first, min(first + BUNDLE // 16, n_groups)):
+        first = at * (BUNDLE // 16)
+        for group in range(first, min(first + BUNDLE // 16, parts[i, PART_GROUPS])):
             chosen = _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes)
             while chosen != 0:
                 lane = v.lowest_bit(chosen)
                 chosen &= chosen - 1
                 for field in range(RECORD):
                     kept[count * RECORD + field] = lanes[field * 16 + lane]
-                kept_ids[count] = index[group * 16 + lane] + first_id
+                kept_ids[count] = index[group * 16 + lane] + first_ids[i]
                 count += 1
         out = v.fetch_add(cursor, 1, count)
-        for i in range(count * RECORD):  # no slices: numba would compile the text of an error about their shapes for seconds
-            records[out * RECORD + i] = kept[i]
-        for i in range(count):
-            ids[out + i] = kept_ids[i]
+        for j in range(count * RECORD):  # no slices: numba would compile the text of an error about their shapes for seconds
+            records[out * RECORD + j] = kept[j]
+        for j in range(count):
+            ids[out + j] = kept_ids[j]

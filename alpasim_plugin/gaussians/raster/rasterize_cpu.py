@@ -22,8 +22,11 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
 from alpasim_plugin.gaussians.constants import (
+    BUNDLE,
     FAR_M,
     NEAR_M,
+    PART_INPUT,
+    PART_SIZE,
     POSE_CENTRE,
     POSE_COLOUR,
     POSE_FAR,
@@ -31,13 +34,12 @@ from alpasim_plugin.gaussians.constants import (
     POSE_ROTATION,
     POSE_SIZE,
     RECORD,
-    SPHERE_SIZE,
     TILE,
 )
 from alpasim_plugin.gaussians.raster.binning import count_tiles, depth_order, fill_tiles, tile_offsets
 from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
-from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
+from alpasim_plugin.gaussians.raster.project_kernels import bundles_in_view, project_parts
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
 from alpasim_plugin.io.places import require_kernels
 
@@ -92,19 +94,14 @@ def rasterize_prepared(
     view = camera_numbers(camera, lod_px)
     turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
     poses = node_poses([T for _, T in nodes], turned, camera, near_m)
-    in_view = nodes_in_view(np.array([prepared.sphere for prepared, _ in nodes]).reshape(-1, SPHERE_SIZE), poses, view)
-    total = sum(len(nodes[i][0]) for i in in_view)
-    records = _buffers.get("records", total * RECORD, np.float32)
-    ids = _buffers.get("ids", total, np.int64)
-    first_ids = np.cumsum([0, *(prepared.n_input for prepared, _ in nodes)])
+    parts = np.array([prepared.row for prepared, _ in nodes], np.int64).reshape(-1, PART_SIZE)
+    first_bundles = bundles_in_view(parts, poses, view)
+    first_ids = np.cumsum(parts[:, PART_INPUT]) - parts[:, PART_INPUT]
+    room = int(first_bundles[-1]) * BUNDLE
+    records, ids = _buffers.get("records", room * RECORD, np.float32), _buffers.get("ids", room, np.int64)
     cursor = np.zeros(2, np.int64)
-    for i in in_view:
-        prepared = nodes[i][0]
-        cursor[0] = 0
-        run_on_threads(
-            threads if len(prepared) > WORTH_THREADS else 1, project_node, cursor, prepared.means, prepared.geometry, prepared.sh,
-            prepared.sh_size, prepared.index, prepared.spheres, first_ids[i], poses[i], view, records, ids,
-        )  # fmt: skip
+    workers = threads if room > WORTH_THREADS else 1
+    run_on_threads(workers, project_parts, cursor, parts, first_bundles, first_ids, poses, view, records, ids)
     count = int(cursor[1])
 
     keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
@@ -114,7 +111,7 @@ def rasterize_prepared(
     rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
     cursor[:] = 0
     run_on_threads(threads, raster_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, records, behind, rgb, alpha, depth)
-    stats = {"gaussians": sum(p.n_input for p, _ in nodes), "visible": count, "pairs": tiles.pairs, "pairs_looked_at": int(cursor[1])}
+    stats = {"gaussians": int(parts[:, PART_INPUT].sum()), "visible": count, "pairs": tiles.pairs, "pairs_looked_at": int(cursor[1])}
     return RasterOutput(rgb, alpha, depth, stats)
 
 
@@ -183,18 +180,21 @@ def node_poses(
     Raises:
         InputError: A transform is not rigid.
     """
-    poses = np.empty((len(T_world_nodes), POSE_SIZE))
-    given = [_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for T in T_world_nodes]
+    given = [_IDENTITY, *(np.asarray(T, dtype=np.float64) for T in T_world_nodes if T is not None)]
     shaped = all(T.shape == (4, 4) for T in given)
-    if not shaped or not all_rigid(np.array(given).reshape(-1, 4, 4)):
+    if not shaped or not all_rigid(np.array(given)):
         for T in given:  # the precise message is composed only where the cheap test of all nodes at once fails
             require_rigid(T, "placing a node")
-    T_world_node = np.array(given).reshape(-1, 4, 4)
+    T_world_node = np.array(given)
     rotation = T_world_node[:, :3, :3]
-    poses[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
-    poses[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
-    poses[:, POSE_NEAR], poses[:, POSE_FAR] = near_m, FAR_M
-    poses[:, POSE_COLOUR:POSE_NEAR] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
+    placed = np.empty((len(given), POSE_SIZE))
+    placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
+    placed[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
+    placed[:, POSE_COLOUR:POSE_NEAR] = rotation.reshape(-1, 9)
+    placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
+    moved = np.array([T is not None for T in T_world_nodes], dtype=bool)
+    poses = placed[np.where(moved, np.cumsum(moved), 0)]  # all that stand in the world share the first
+    poses[~turned, POSE_COLOUR:POSE_NEAR] = np.eye(3).reshape(9)
     return poses
 
 

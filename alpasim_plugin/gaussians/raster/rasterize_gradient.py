@@ -22,7 +22,8 @@ from alpasim_plugin.gaussians.raster.binning import depth_order
 from alpasim_plugin.gaussians.raster.gradient_kernels import KEPT, PAIR, colour_splats, composite_tiles, tile_gradients
 from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
-from alpasim_plugin.gaussians.raster.project_kernels import project_node
+from alpasim_plugin.gaussians.raster.prepared import part_row
+from alpasim_plugin.gaussians.raster.project_kernels import project_parts
 from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     WORTH_THREADS,
     Buffers,
@@ -97,9 +98,9 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[n
     cursor = np.zeros(2, np.int64)
     index = np.arange(groups * _LANES, dtype=np.int64)
     workers = view.threads if n > WORTH_THREADS else 1
-    run_on_threads(
-        workers, project_node, cursor, lane_means, geometry, plain, 1, index, everywhere, 0, view.pose, view.numbers, records, ids
-    )
+    parts = part_row((lane_means, geometry, plain, index, everywhere, everywhere), 1, n)[None]
+    bundles, first = np.array([0, -(-n // BUNDLE)]), np.zeros(1, np.int64)
+    run_on_threads(workers, project_parts, cursor, parts, bundles, first, view.pose[None], view.numbers, records, ids)
     count = int(cursor[1])
     cursor[:] = 0
     centre = view.pose[POSE_CENTRE : POSE_CENTRE + 3]

@@ -8,7 +8,7 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Scenario
-from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades, place_houses
 from alpasim_plugin.gaussians.scene.build_road import build_road
@@ -75,11 +75,3 @@ def lit(node: SceneNode, light: F64) -> SceneNode:
         sh[:, 0] += dc_from_rgb(0.5 * light)  # colour is 0.5 + C0 dc: the half is lit as well
         levels.append(replace(level, cloud=replace(level.cloud, sh=sh.astype(np.float32))))
     return replace(node, levels=tuple(levels))
-
-
-def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
-    """Move a cloud by a similarity transform; its colours turn with it."""
-    scale = float(np.cbrt(np.linalg.det(T_world_file[:3, :3])))
-    rigid = np.asarray(T_world_file, dtype=np.float64).copy()
-    rigid[:3, :3] /= scale
-    return replace(cloud, means=cloud.means * scale, scales=cloud.scales * scale).transformed(rigid)

@@ -213,7 +213,7 @@ def _arguments(factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any
     return {p.name: known[p.name] for p in named if p.name in known}
 
 
-_PER_FRAME = "alpasim_plugin.fixers.per_frame:per_frame"
+_PER_FRAME = "alpasim_plugin.fixers.identity:per_frame"
 _BROKEN = "alpasim_plugin.renderers.broken:"
 
 BUILTIN: dict[str, dict[str, tuple[str, str]]] = {

@@ -14,11 +14,11 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.process.subprocesses import copy_context, end_with_parent, load_for_copies, spawn_context
 from alpasim_plugin.runtime.executors.base import THREAD_VARIABLES, Backend, Died, Done, Event, Lost, Place, Rules
 from alpasim_plugin.runtime.executors.pool import run_jobs
 
@@ -28,6 +28,7 @@ Send = Callable[[Any], None]
 
 GRACE_S = 5.0  # between asking a worker to end and ending it
 DYING = "look for the out-of-memory killer in the system log, or use"
+AHEAD = "alpasim_plugin.runtime.executors.ahead"  # loads what rollouts need
 RULES = Rules(chunk_s=0.0, most_losses=1, copies=False, after_hanging="", after_dying="")
 
 
@@ -93,6 +94,12 @@ def _advised(got: R | Lost) -> R | Lost:
     if got.hung:
         return replace(got, do_this="look at what hangs with --workers 1, or raise --time-limit")
     return Lost(f"{got.found}, twice, without an error message", do_this=f"{DYING} --workers 1")
+
+
+def load_early() -> None:
+    """Load what rollouts need, while this process finds out what to do: workers of one thread are then copies that have it."""
+    with _thread_environment(1):
+        load_for_copies([AHEAD])
 
 
 def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterator[tuple[J, R]]:
@@ -180,7 +187,7 @@ def _ignore(text: str) -> None:
 
 @dataclass
 class _Worker:
-    process: SpawnProcess
+    process: BaseProcess
     pipe: Connection
     ready: bool = False
     job: Any = None
@@ -250,7 +257,7 @@ class LocalBackend(Backend[J]):
         self._workers.clear()
 
     def _open(self) -> None:
-        context = spawn_context()
+        context = (copy_context() if self._threads == 1 else None) or spawn_context()
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._work, self._on_message is not None), daemon=False)
         with _thread_environment(self._threads):

@@ -1,0 +1,22 @@
+"""Load what most rollouts need, kernels too where they are compiled: imported by the process that workers are copies of.
+
+None of it starts a thread but that of an allocator, which forks well. What is missing here is loaded by each worker.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from alpasim_plugin.plugins import kernels
+from alpasim_plugin.runtime.execute import is_cold
+
+NEEDED = (
+    "alpasim_plugin.control.tracker", "alpasim_plugin.renderers.gaussian", "evaluators.metrics.image_health", "evaluators.metrics.motion",
+    "evaluators.metrics.offroad", "evaluators.metrics.outcomes", "evaluators.metrics.plan", "policies.lane_camera", "pyarrow.dataset",
+    "scipy.linalg.lapack", "scipy.spatial",
+)  # fmt: skip
+
+for name in NEEDED:
+    import_module(name)
+if not is_cold("rasteriser"):
+    kernels.call("rasteriser")
