@@ -81,9 +81,9 @@ class Run:
 
     @property
     def scenes_asked(self) -> list[str]:
-        """List what the command named as scenarios: paths that a command may name again."""
+        """List what the command named as scenarios, or, where no command did, paths that one may name."""
         refs = [scene.get("ref") or {} for scene in (self.info.get("scenes") or {}).values()]
-        return list(dict.fromkeys(str(ref["path"]) for ref in refs if ref.get("path")))
+        return self.info.get("asked") or list(dict.fromkeys(str(ref["path"]) for ref in refs if ref.get("path")))
 
     @property
     def variants(self) -> list[str]:

@@ -29,17 +29,19 @@ from evaluators.report.flips import baseline_of
 
 DOING = "finding why a drive failed"
 MOST_DRIVES = 8
+NEARLY = 1.5  # once a change mends the drive, those with up to so many times its distance from the recording are driven as well
 SLOW_US = 150_000  # a policy that answers later than this has a latency of its own
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Driven:
-    """A drive with a change: how it ended, and whether without an event."""
+    """A drive with a change: how it ended, whether without an event, and how far beside the recorded path it went."""
 
     trial: Trial
     outcome: str
     mends: bool
+    aside_m: float = np.inf
 
 
 def explain(past: LoggedRollout, run: Run, say: Say) -> Cause:
@@ -123,12 +125,15 @@ def _tried(findings: Findings, driven: Sequence[Driven]) -> list[tuple[str, str,
 
 
 def _drives(past: LoggedRollout, promising: Sequence[Tried], say: Say) -> list[Driven]:
-    """Drive with one change after the other, until one mends the drive."""
+    """Drive with one change after the other, the best first, until those that are left are much worse than one that mends the drive."""
     driven: list[Driven] = []
+    far_m = np.inf
     for tried in promising:
-        driven.append(_drive(past, tried, say))
-        if driven[-1].mends:
+        error_m = tried.error_m or 0.0
+        if error_m > far_m:
             break
+        driven.append(_drive(past, tried, say))
+        far_m = min(far_m, NEARLY * error_m) if driven[-1].mends else far_m
     return driven
 
 
@@ -145,8 +150,8 @@ def _drive(past: LoggedRollout, tried: Tried, say: Say) -> Driven:
         manifest = run_cell(past.cell, options, Path(folder), thread_budget(1, 1).per_worker, parts, lambda _: past.scenario)
     if manifest["status"] != "ok":
         return Driven(tried.trial, f"failed: {manifest['error']['found']}", False)
-    outcomes = _outcomes(manifest)
-    return Driven(tried.trial, in_words(outcomes), not outcomes)
+    outcomes, aside = _outcomes(manifest), manifest["metrics"].get("lateral_distance_m") or {}
+    return Driven(tried.trial, in_words(outcomes), not outcomes, aside["value"] if aside.get("valid") else np.inf)
 
 
 # --- where plans part -----------------------------------------------------------------------------------------------
@@ -188,9 +193,15 @@ def _by_policy(past: LoggedRollout, run: Run, rollout: Rollout) -> list[Parting]
 def _sentences(
     findings: Findings, driven: Sequence[Driven], partings: Sequence[Parting], start_us: int, failed_us: int | None
 ) -> list[tuple[str, str]]:
-    """Return what was found, the surest first, each with how sure it is: shown, seen or not found."""
-    out = [("shown", f"With {one.trial.name} the drive ends without an event: {one.trial.cause}.") for one in driven if one.mends]
-    out += _about_pictures(findings, start_us)
+    """Return what was found, the surest first, each with how sure it is: shown, seen or not found.
+
+    Several changes may mend a drive: the one that goes nearest to the recorded path is the likely cause.
+    """
+    out = _about_pictures(findings, start_us)
+    mend = sorted((one for one in driven if one.mends), key=lambda one: one.aside_m)
+    out += [("shown", f"With {one.trial.name} the drive ends without an event: {one.trial.cause}.") for one in mend[:1]]
+    if mend[1:]:
+        out.append(("seen", f"it ends so with {', '.join(one.trial.name for one in mend[1:])} too, but farther from the recorded path."))
     for one in partings:
         same = one.kind == "renderer" and one.t_us is None
         out.append(("seen", f"the pictures are not the cause. {sentence(one, start_us)[1]}") if same else sentence(one, start_us))
@@ -199,8 +210,9 @@ def _sentences(
             out.append(("seen", f"its plans do not depend on the {used.what.split(',')[0]}."))
     if not findings.repeatable:
         out.append(("seen", "it plans otherwise when asked the same again, so nothing was tried: a policy must repeat itself for a seed."))
-    elif failed_us is not None and not any(one.mends for one in driven):
+    elif failed_us is not None and not any(how == "shown" for how, _ in out):
         out.append(("not found", "no single change of what it sees or answers mends the drive."))
+    out.sort(key=lambda one: one[0] != "shown")
     return [(how, text[0].upper() + text[1:]) for how, text in out]
 
 

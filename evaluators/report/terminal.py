@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from rich import box
@@ -101,6 +103,8 @@ MOST_ARMS = 12  # named at the end of a run
 MORE_SCENES = "suites/urban"
 FORK_AT_S = 1.0  # seconds of the drive that a suggested fork keeps
 SEEING = "lane-camera"  # a shipped policy with a camera
+KEPT = ("--set", "--preset", "--controller")  # options of a command that the next one has too
+OF_A_SCENE = ("road", "ego", "actors")  # settings that another scene cannot have
 
 
 def ending_lines(run: Run) -> list[str]:
@@ -194,7 +198,12 @@ def _other(run: Run) -> str:
 def _again(run: Run, renderers: Sequence[str], scenes: list[str], policy: str = "") -> list[str]:
     seeds = max(1, len(run.info.get("seeds") or ()))
     drivers = policy or ",".join(run.policies)
-    return ["simrun", "--renderer", ",".join(dict.fromkeys(renderers)), "--policy", drivers, "--seeds", str(seeds), *scenes]
+    given = [word for text in run.info.get("command") or () for word in (text.split("=", 1) if text.startswith("--") else [text])]
+    kept = [(flag, value) for flag, value in pairwise(given) if flag in KEPT]
+    if scenes == [MORE_SCENES]:
+        kept = [(flag, value) for flag, value in kept if not re.match(rf"({'|'.join(OF_A_SCENE)})\b", value)]
+    words = ["simrun", "--renderer", ",".join(dict.fromkeys(renderers)), "--policy", drivers, "--seeds", str(seeds)]
+    return [*words, *(word for pair in kept for word in pair), *scenes]
 
 
 def labelled(label: str, text: str) -> str:

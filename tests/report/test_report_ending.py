@@ -96,6 +96,16 @@ def test_what_is_undecided_leads_to_more_scenes(tmp_path: Path, renderers: tuple
         assert words_of(run)[-1] == "suites/urban"
 
 
+def test_the_next_command_keeps_scenes_settings_and_preset(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=20, pictures=False, clips=False)))
+    run = dataclasses.replace(run, rollouts=tuple(one for one in run.rollouts if not outcomes_of(one)))
+    given = ["simrun", "--set", "timing.duration_us=600000", "--set=actors=[]", "--preset", "strict", "suites/smoke"]
+    run = dataclasses.replace(run, info={**run.info, "command": given, "asked": ["suites/smoke"]})
+    assert words_of(run)[7:] == ["--set", "timing.duration_us=600000", "--set", "actors=[]", "--preset", "strict", "suites/smoke"]
+    elsewhere = words_of(dataclasses.replace(run, info={**run.info, "asked": []}))
+    assert elsewhere[7:] == ["--set", "timing.duration_us=600000", "--preset", "strict", "suites/urban"]
+
+
 def test_a_policy_without_a_camera_leads_to_one_that_looks(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=20)))
     blind = dataclasses.replace(run, rollouts=tuple(dataclasses.replace(r, frames=0) for r in run.rollouts if r.ok))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -30,15 +31,10 @@ NAMED = {
 }
 
 
-MEASURED = ("SteeringSign", "Latency", "SwappedChannels", "WorldAxes", "Blind")
-OTHERWISE = pytest.mark.xfail(
-    reason="another change mends the drive as well and is tried first, or not yet measured: docs/why.md", strict=False
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("bug", [bug if bug in MEASURED else pytest.param(bug, marks=OTHERWISE) for bug in NAMED])
-def test_the_page_names_the_fault(bug: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("bug", NAMED)
+def test_the_page_names_the_fault(bug: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("alpasim_plugin.runtime.trials.MOST_S", math.inf)  # on a busy machine too
     (tmp_path / "bend.yaml").write_text(BEND)
     policy = f"tests.runtime.seeded_bugs:{bug}"
     plan = make_plan(expand(str(tmp_path / "bend.yaml")), (PAINTED,), (policy,), (0,), RunOptions())
@@ -48,4 +44,4 @@ def test_the_page_names_the_fault(bug: str, tmp_path: Path, capsys: pytest.Captu
     assert run_command(["why", str(folder), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     print(json.dumps(found["found"]), found["tried"][:4])
-    assert any(NAMED[bug] in one["text"] for one in found["found"])
+    assert NAMED[bug] in found["found"][0]["text"]

@@ -96,6 +96,7 @@ def test_a_seeded_fault_is_named(run: Path, policy: str, words: str, capsys: pyt
     assert run_command(["why", str(rollout(run, policy)), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert any(one["how"] == "shown" and words in one["text"].lower() for one in found["found"]), found
+    assert "not found" not in [one["how"] for one in found["found"]]
     page = Path(found["page"]).read_text()
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
     assert words in page.lower()
