@@ -163,14 +163,14 @@ def gate_cases(names: list[str]) -> Iterator[tuple[str, str, str]]:
                 for label, renderer in renderers.items():
                     rgb = renderer.render(request).rgb
                     for case, (drawn, T, there) in maps.items():
-                        yield label, case, verdict(drawn, spec, T, there, rgb)
+                        yield label, case, verdict(drawn, spec, T, there, rgb, aside_m)
         other = scene_map, seen(0), boxes
         clear_cache()
 
 
-def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorBox], rgb: np.ndarray) -> str:
-    """Return what the gate says of a map."""
-    if map_gate.contradiction(scene_map, spec, T, boxes, rgb, 1):
+def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorBox], rgb: np.ndarray, beside_m: float) -> str:
+    """Return what the gate says of a map; the picture was taken ``beside_m`` to the left of the recorded path."""
+    if map_gate.contradiction(scene_map, spec, T, boxes, rgb, beside_m, 1):
         return "off"
     lines = map_gate.line_pixels(draw_map(scene_map, spec, T, threads=1))
     here = map_gate.agreement(map_gate.pieces_of(lines), map_gate.top_hat(rgb))
