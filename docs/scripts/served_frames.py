@@ -3,6 +3,7 @@
 python docs/scripts/served_frames.py shutter SCENARIO WIDTH HEIGHT [--turn DEG_S]    bands against rows: time and error
 python docs/scripts/served_frames.py batch                                          cameras one by one and in one pass
 python docs/scripts/served_frames.py gate SCENARIO...                               agreement of right and wrong maps
+python docs/scripts/served_frames.py truth AlpaSim_RUN CLEAN_PORT PORT...           served frames of its requests against the truth
 """
 
 from __future__ import annotations
@@ -10,20 +11,27 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.alpasim.bridge.client import RendererClient
 from alpasim_plugin.alpasim.server import map_gate
 from alpasim_plugin.core.geometry import interpolate, se2
+from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.shutter import bands, bands_of, rolling
 from alpasim_plugin.core.types import F64, CameraSpec, Degradation, Exposure, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.log.asl import AslReader
+from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.renderers import rolling as drawing
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, actor_boxes, prepare_map
+from alpasim_plugin.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 
 SHUTTER_US = 30_000
@@ -125,6 +133,23 @@ def batch_row(precision: str, cameras: int, height: int, width: int, references:
     return f"| {precision} | {cameras} | {width} x {height} | {references} | {times[0]:.0f} | {times[1]:.0f} | {apart} |"
 
 
+def truth(run: Path, ports: list[str]) -> None:
+    """Ask services at ``ports`` for what AlpaSim's runtime asked in the first drive of each scene; the first one has the truth."""
+    with ExitStack() as stack:
+        clients = [stack.enter_context(RendererClient(f"127.0.0.1:{port}")) for port in ports]
+        for scene in sorted((run / "rollouts").iterdir()):
+            log = AslReader(min(scene.rglob("rollout.asl")))
+            calls = [e.batch_render_request for e in log if e.WhichOneof("log_entry") == "batch_render_request"]
+            found = []
+            for call in calls:
+                for item in call.items:
+                    item.request.image_format = sensorsim_pb2.PNG
+                right, *shown = (client.render([item.request for item in call.items]) for client in clients)
+                found.append([[psnr_db(decode_image(one[name]), decode_image(right[name])) for name in right] for one in shown])
+            gains = np.array(found).mean(axis=2)
+            print(f"| {scene.name} | {len(calls)} | {' | '.join(f'{mean:.2f}' for mean in gains.mean(axis=0))} |", flush=True)
+
+
 def gate(names: list[str]) -> None:
     """Print shares of frames in which the map is contradicted, by renderer and by what is wrong with the map."""
     counts: dict[tuple[str, str], list[str]] = {}
@@ -163,14 +188,14 @@ def gate_cases(names: list[str]) -> Iterator[tuple[str, str, str]]:
                 for label, renderer in renderers.items():
                     rgb = renderer.render(request).rgb
                     for case, (drawn, T, there) in maps.items():
-                        yield label, case, verdict(drawn, spec, T, there, rgb)
+                        yield label, case, verdict(drawn, spec, T, there, rgb, aside_m)
         other = scene_map, seen(0), boxes
         clear_cache()
 
 
-def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorBox], rgb: np.ndarray) -> str:
-    """Return what the gate says of a map."""
-    if map_gate.contradiction(scene_map, spec, T, boxes, rgb, 1):
+def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorBox], rgb: np.ndarray, beside_m: float) -> str:
+    """Return what the gate says of a map; the picture was taken ``beside_m`` to the left of the recorded path."""
+    if map_gate.contradiction(scene_map, spec, T, boxes, rgb, beside_m, 1):
         return "off"
     lines = map_gate.line_pixels(draw_map(scene_map, spec, T, threads=1))
     here = map_gate.agreement(map_gate.pieces_of(lines), map_gate.top_hat(rgb))
@@ -179,7 +204,7 @@ def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorB
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["shutter", "batch", "gate"])
+    parser.add_argument("what", choices=["shutter", "batch", "gate", "truth"])
     parser.add_argument("rest", nargs="*")
     parser.add_argument("--turn", type=float, default=0.0)
     given = parser.parse_args()
@@ -187,5 +212,7 @@ if __name__ == "__main__":
         shutter(given.rest[0], int(given.rest[1]), int(given.rest[2]), given.turn)
     elif given.what == "batch":
         batch()
+    elif given.what == "truth":
+        truth(Path(given.rest[0]), given.rest[1:])
     else:
         gate(given.rest)

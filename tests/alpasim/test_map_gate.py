@@ -15,6 +15,7 @@ from alpasim_plugin.alpasim.server.map_gate import (
     FITS,
     Pieces,
     agreement,
+    beside,
     contradiction,
     leftwards,
     line_pixels,
@@ -95,6 +96,17 @@ def test_a_road_user_hides_lines_from_the_comparison() -> None:
     lines = line_pixels(draw_map(prepared(1.75), SPEC, AHEAD)) & (np.arange(270)[:, None] > 150)
     striped[np.roll(lines, 30, axis=1)] = 200  # the lines of the map, beside where it has them, painted on the bus
     assert contradiction(prepared(1.75), SPEC, AHEAD, (bus,), striped) is None
+
+
+def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence() -> None:
+    """A poor reconstruction seen from a metre beside the path: its lines are aside by that metre. Others still are evidence."""
+    unmoved = photograph(aside_m=0.9)
+    assert judged(unmoved, prepared()).aside_m == pytest.approx(0.9)
+    assert contradiction(prepared(), SPEC, AHEAD, (), unmoved, beside_m=1.0) is None
+    assert contradiction(prepared(), SPEC, AHEAD, (), photograph(aside_m=1.75), beside_m=1.0) is not None
+    path = np.array([[0.0, 0.0], [50.0, 0.0]])
+    assert beside(path, se2(4.0, 1.0, 0.1), se2(4.0, 1.0, 0.1) @ AHEAD) == pytest.approx(np.cos(0.1))
+    assert beside(path, se2(4.0, -1.0, 0.0), se2(0, 0, np.pi) @ AHEAD) == pytest.approx(1.0), "of a camera that looks back"
 
 
 def test_a_large_picture_is_compared_at_a_small_width() -> None:

@@ -7,17 +7,19 @@ row of pixels is compared with equal pieces beside it: how often is it the brigh
 A picture may show no paint at all: an unmarked street, glare, a poor reconstruction. That is no evidence against the map. A map is
 contradicted where its lines are not found where it has them (agreement below `DOUBT`) and the same lines are found to one side of it
 (`FITS` or more at one of `ASIDE_M`): then the picture shows paint, and somewhere else. A map of another street whose lines fit nowhere is
-not told from a street without paint.
+not told from a street without paint. A poor reconstruction, seen from beside the recorded path, leaves paint where the recording shows it:
+lines that are aside by as much as the camera is (within `UNMOVED_M`) are no evidence either.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.geometry import project
 from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
@@ -30,6 +32,7 @@ LEAST_PIECES = 40  # of lines in rows; fewer say nothing
 DOUBT, FITS = 0.56, 0.64
 NOTHING = prepare_map(LaneMap({}))
 ASIDE_M = (-2.2, -1.75, -1.3, -0.9, 0.9, 1.3, 1.75, 2.2)
+UNMOVED_M = 0.45
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,13 @@ class Contradiction:
 
 
 def contradiction(
-    scene_map: PreparedMap, camera: CameraSpec, T_world_camera: F64, boxes: Sequence[ActorBox], rgb: U8, threads: int | None = None
+    scene_map: PreparedMap,
+    camera: CameraSpec,
+    T_world_camera: F64,
+    boxes: Sequence[ActorBox],
+    rgb: U8,
+    beside_m: float = 0.0,
+    threads: int | None = None,
 ) -> Contradiction | None:
     """Compare a picture with the map; None: they do not contradict each other.
 
@@ -66,6 +75,7 @@ def contradiction(
         T_world_camera: ``(4, 4)``.
         boxes: Road users, which hide lines.
         rgb: ``(H, W, 3)`` the picture.
+        beside_m: How far to the left of the recorded path the camera stands (`beside`).
         threads: Of the map rasteriser.
     """
     small = shrunk(camera)
@@ -77,11 +87,15 @@ def contradiction(
         T[:3, 3] -= aside_m * leftwards(T_world_camera)  # who stands to the right sees the lines to the left
         return agreement(pieces_of(line_pixels(draw_map(scene_map, small, T, threads=threads)) & open_road), paint)
 
+    return decided(found, beside_m)
+
+
+def decided(found: Callable[[float], float | None], beside_m: float) -> Contradiction | None:
+    """Decide from the agreement of a map's lines, moved to the left by some metres, and where the camera stands."""
     here = found(0.0)
     if here is None or here >= DOUBT:
         return None
-    there = [(found(aside_m) or 0.0, aside_m) for aside_m in ASIDE_M]
-    best, aside_m = max(there)
+    best, aside_m = max((found(aside_m) or 0.0, aside_m) for aside_m in ASIDE_M if abs(aside_m - beside_m) > UNMOVED_M)
     return Contradiction(here, best, aside_m) if best >= FITS else None
 
 
@@ -98,6 +112,18 @@ def leftwards(T_world_camera: F64) -> F64:
     ahead = T_world_camera[:2, 2]
     left = np.array([-ahead[1], ahead[0], 0.0])
     return left / max(float(np.linalg.norm(left)), 1e-9)
+
+
+def beside(path: F64, T_world_rig: F64, T_world_camera: F64) -> float:
+    """Return how far a rig stands beside the recorded path ``(N, 2+)``, metres along the camera's left.
+
+    Example:
+        >>> ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+        >>> beside(np.array([[0.0, 0], [9, 0]]), np.array([[1.0, 0, 0, 4], [0, 1, 0, 2], [0, 0, 1, 0], [0, 0, 0, 1]]), ahead)
+        2.0
+    """
+    left = project(path, T_world_rig[:2, 3])[1]
+    return left * (project(path, T_world_rig[:2, 3] + leftwards(T_world_camera)[:2])[1] - left)
 
 
 def line_pixels(drawn: U8) -> Bool:

@@ -22,7 +22,7 @@ import grpc
 import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
-from alpasim_plugin.alpasim.server.map_gate import contradiction
+from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import Lens, View, read_lens, straight_of
@@ -151,7 +151,8 @@ def gated(rendered: Rendered, entry: SceneEntry, asked: RenderRequest, shown: U8
     """
     assert entry.scene_map is not None, "a frame with a map is of a scene with one"
     T, actors = at_share(asked, 0.5) if asked.exposure is not None else (asked.T_world_camera[1], asked.actors)
-    found = contradiction(entry.scene_map, asked.camera, T, actor_boxes(actors, entry.scenario.actors), shown, threads)
+    beside_m = beside(entry.scenario.ego_log.xyz, T @ inverse(mount_of(entry, view)), T)
+    found = contradiction(entry.scene_map, asked.camera, T, actor_boxes(actors, entry.scenario.actors), shown, beside_m, threads)
     if found is None:
         return rendered
     what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
