@@ -25,14 +25,18 @@ from alpasim_plugin.lab.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.lab.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.lab.bench.quality import RAW, Variant
 from alpasim_plugin.lab.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
+from alpasim_plugin.lab.bench.regime import measure_regime
 from alpasim_plugin.lab.bench.trained_arms import STEPS, TRANSFER_STEPS, trained_arms, within_budget
 from alpasim_plugin.lab.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.lab.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.lab.paper.appearance import OURS as APPEARANCE
+from alpasim_plugin.lab.paper.claims import WINDOWS
 from alpasim_plugin.lab.paper.cost import Cost, contested
 from alpasim_plugin.lab.paper.document import EqualTime, Findings
 from alpasim_plugin.lab.paper.measured import Measured, from_rows
 from alpasim_plugin.lab.paper.page import ShownClip
+from alpasim_plugin.lab.paper.position import windows
+from alpasim_plugin.lab.paper.regime import TRAINED_ON_CLEAN, TRAINED_ON_OWN, RegimeClip, as_measured
 from alpasim_plugin.lab.paper.training import TrainedArm
 from alpasim_plugin.lab.paper.wrong_map import Shift
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE
@@ -78,7 +82,7 @@ class PaperRun:
         map_clips: Clips of the protocol ``map-error``.
         transfer: What the protocol ``transfer`` is measured on; None: it is not.
         equal_time: Folder like ``arms`` of the arms trained with equal core-minutes; None: that budget is not measured.
-        other_seeds: Folders like ``arms`` of the same arms trained with other seeds, for the protocol ``cost``.
+        other_seeds: Folders like ``arms`` of the same arms trained with other seeds, for the protocols ``cost`` and ``regime``.
     """
 
     pairs: Path
@@ -113,6 +117,7 @@ class Compared:
         shifted: The protocol ``map-error`` by configuration, where ``measured`` has groups of them.
         memory: Peak memory of a training sample by clip length and horizon.
         cost: Quality against training time; None where it was not asked for.
+        regime: Clips of the regime map.
         training: How the arms were trained, as far as their folder says.
         equal_time: The arms of equal core-minutes; None where they were not asked for.
     """
@@ -124,6 +129,7 @@ class Compared:
     shifted: Measured | None = None
     memory: list[MemoryCell] = field(default_factory=list)
     cost: Cost | None = None
+    regime: list[RegimeClip] = field(default_factory=list)
     training: tuple[TrainedArm, ...] = ()
     equal_time: EqualTime | None = None
 
@@ -162,7 +168,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     Args:
         run: What is compared, on what, how.
         told: Called after every clip of an arm.
-        told_clip: Called after every clip of the appearance experiment: its number, their count, its name.
+        told_clip: Called after every clip of the appearance experiment and of the regime map: its number, their count, its name.
 
     Raises:
         InputError: No clip for a protocol.
@@ -179,6 +185,9 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         if name in run.protocols:
             sequences = _sequences(run, name)
             _open_loop(run, name, sequences, arms, frozenset(s.name for s in evenly(sequences, run.filmed)), told, out)
+    if (found := out.measured.get("under-trained")) is not None:
+        frames = min(int(row_of(work)["frames"]) for work in out.works["under-trained"])
+        out.measured |= dict(zip(WINDOWS, windows(found, frames), strict=False))
     if "cycle" in run.protocols:
         out.shown = shown_clips(out.works["cycle"])
     if "map-error" in run.protocols:
@@ -195,6 +204,10 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         _open_loop(replace(run, frames=frames), "cost", clips, snapshots, frozenset(), told, out)
         out.cost = Cost(tuple(curves), out.measured["cost"], about)
         out.measured["cost"] = contested(out.cost)
+    if "regime" in run.protocols:
+        sequences = evenly(PairDataset(run.pairs, run.split).sequences, run.clips)
+        out.regime = measure_regime(sequences, _by_history(run), told_clip)
+        out.measured["regime"] = as_measured(out.regime)
     if "transfer" in run.protocols and run.transfer is not None:
         tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms, "--transfer-arms", TRANSFER_STEPS)
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
@@ -204,6 +217,18 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     if "appearance" in run.protocols and bundle.is_file():
         out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
+
+
+def _by_history(run: PaperRun) -> tuple[Variant, ...]:
+    """Return the shipped generator, and those that were trained on their own history and on clean frames, where both are there."""
+    found = [Variant(SHIPPED[0], resolve("fixer", SHIPPED[0], ()))]
+    for i, folder in enumerate((run.arms, *run.other_seeds)):
+        arms = [arm for arm in arms_in(folder) if arm.label in (TRAINED_ON_OWN, TRAINED_ON_CLEAN)]
+        if len(arms) == 1:
+            do = f"train {TRAINED_ON_OWN} and {TRAINED_ON_CLEAN} ('simrun train per-frame --variant')"
+            raise InputError(DOING, f"{folder}, protocol regime", f"{arms[0].label} alone", do)
+        found += [replace(arm, label=f"{arm.label}, seed {i}") if i else arm for arm in arms]
+    return tuple(found)
 
 
 def _equal_time(run: PaperRun, folder: Path, found: Sequence[Variant], told: Told, out: Compared) -> EqualTime:
@@ -238,6 +263,7 @@ def findings(compared: Compared) -> Findings:
         compared.cost,
         compared.training,
         compared.equal_time,
+        compared.regime,
     )
 
 

@@ -142,7 +142,7 @@ def measure(
     vdp: ColourVideoVDP | None = None,
 ) -> dict[str, Any]:
     """Return the row of one clip under one variant, as `alpasim_plugin.lab.video_metrics.summary` takes it."""
-    found = clip_quality(result.video, None if variant.label == TRUTH else clip.truth, networks)
+    found = clip_quality(result.video, None if variant.label == TRUTH else clip.truth, networks, clip.sdmap)
     values = dict(found.means)
     if vdp is not None and variant.label != TRUTH:
         values[JOD] = float(vdp.jod(result.video[::JOD_EVERY], clip.truth[::JOD_EVERY]).mean())

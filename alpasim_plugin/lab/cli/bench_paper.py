@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,22 +13,21 @@ from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_json, write_text
-from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.bench.paper import DOING, PaperRun, compare_arms, findings
 from alpasim_plugin.lab.bench.quality_run import Work
 from alpasim_plugin.lab.bench.transfer import TransferData
 from alpasim_plugin.lab.cli.training_options import whole_numbers
-from alpasim_plugin.lab.paper.document import document, draw_figures
+from alpasim_plugin.lab.paper.document import claims_document, document, draw_figures
 from alpasim_plugin.lab.paper.page import render_side_by_side
 from alpasim_plugin.lab.paper.published import published
-from alpasim_plugin.lab.paper.verdict import judge_claims
+from alpasim_plugin.lab.paper.record import record_of, recorded
 from alpasim_plugin.lab.training.model_card import command as command_line
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.runtime.provenance import hardware, versions
 
 BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer", "appearance")
-PROTOCOLS = (*BY_DEFAULT, "cost")
+PROTOCOLS = (*BY_DEFAULT, "cost", "regime")
 EPILOG = """
 Examples:
 
@@ -43,6 +42,8 @@ Examples:
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --only cost --judges 0 --out runs/cost`
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --other-seed runs/arms-seed1 --only cost --judges 0 --out runs/cost`
+
+- `simrun bench paper data/pairs --arms runs/history --split val --only regime --record runs/paper/paper.json --out runs/regime`
 """
 
 
@@ -65,7 +66,7 @@ def paper(
     ] = None,
     other_seeds: Annotated[
         list[Path] | None,
-        typer.Option("--other-seed", help="Folder like --arms trained with another --seed, for --only cost; may be repeated."),
+        typer.Option("--other-seed", help="Folder like --arms trained with another --seed, for --only cost or regime; may be repeated."),
     ] = None,
     transfer: Annotated[
         Path | None, typer.Option("--transfer", help="Pairs beyond driving, for the table of the transfer (docs/lab/pairs.md).")
@@ -80,7 +81,9 @@ def paper(
     judges: Annotated[str | None, typer.Option("--judges", help="Ask the judges of these seeds, as 0,1 (docs/lab/judges.md).")] = None,
     judge_folder: Annotated[Path | None, typer.Option("--judge-folder", help="Folder of judges that you froze.")] = None,
     weights: Annotated[Path | None, typer.Option("--metric-weights", help=f"Folder of metric weights; also {FOLDER_VARIABLE}.")] = None,
-    reasons: Annotated[Path | None, typer.Option("--reasons", help="JSON, claim number -> a paragraph on why it comes out so.")] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="An earlier paper.json: judges the claims that nothing measured here judges.")
+    ] = None,
     map_clips: Annotated[int, typer.Option("--map-clips", min=2, help="Clips of the protocol map-error: 45 maps each.")] = 8,
     filmed: Annotated[int, typer.Option("--filmed", min=1, help="Clips on the page.")] = 2,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Clips at a time, one thread each; times are then of a busy machine.")] = 1,
@@ -96,9 +99,12 @@ def paper(
     protocols = tuple(name.strip() for name in only.split(",") if name.strip())
     if unknown := [name for name in protocols if name not in PROTOCOLS]:
         raise InputError(DOING, f"--only {only}", f"unknown: {', '.join(unknown)}", f"choose from {', '.join(PROTOCOLS)}")
-    if other_seeds and "cost" not in protocols:
+    if other_seeds and not {"cost", "regime"} & set(protocols):
         raise InputError(
-            DOING, f"--other-seed {other_seeds[0]}", f"--only {only}", "add the protocol cost to --only, or leave --other-seed out"
+            DOING,
+            f"--other-seed {other_seeds[0]}",
+            f"--only {only}",
+            "add the protocol cost or regime to --only, or leave --other-seed out",
         )
     judging = None
     if judges is not None:
@@ -108,7 +114,7 @@ def paper(
         None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames), equal_time,
         tuple(other_seeds or ()),
     )  # fmt: skip
-    why = {} if reasons is None else read_reasons(reasons)  # before hours of measuring
+    earlier = {} if record is None else recorded(record)  # before hours of measuring
     console = Console(stderr=True)
 
     def told(protocol: str, i: int, n: int, work: Work, row: Mapping[str, Any]) -> None:
@@ -118,36 +124,21 @@ def paper(
 
     def told_clip(i: int, n: int, name: str) -> None:
         if not as_json:
-            console.print(f"appearance {i}/{n} {name}")
+            console.print(f"clip {i}/{n} {name}")
 
     found = compare_arms(run, told, told_clip)
-    made = findings(found)
-    judged = judge_claims(found.measured)
+    made = replace(findings(found), recorded=earlier)
     command = command_line()
-    write_text(out / "paper.md", document(published(), made, why, command))
+    write_text(out / "paper.md", document(published(), made, command))
+    write_text(out / "claims.md", f"```bash\n{command}\n```\n\n{claims_document(made)}")
     draw_figures(made, out)
     if found.cost is not None:
         console.print(f"cost: {found.cost.about}", highlight=False)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
-    verdicts = [
-        {"number": one.claim.number, "verdict": one.verdict, "comparisons": [asdict(result) for result in one.results]} for one in judged
-    ]
-    write_json(out / "paper.json", {**facts, "claims": verdicts})
+    verdicts = [{"claim": one.claim.text, "verdict": one.verdict, "comparisons": [asdict(r) for r in one.results]} for one in made.judged]
+    kept = record_of(found.measured, {name: measured.arms for name, measured in found.measured.items()})
+    write_json(out / "paper.json", {**facts, "claims": verdicts, "protocols": kept})
     if found.shown:
         first = made.rows["cycle"][0]["size"]
         write_text(out / "side-by-side.html", render_side_by_side(found.shown, (int(first[0]), int(first[1]))))
     print(json.dumps(verdicts) if as_json else f"wrote {out / 'paper.md'}")
-
-
-def read_reasons(path: Path) -> dict[int, str]:
-    """Return why claims come out as they do, by number.
-
-    Raises:
-        InputError: No such file, or something else than numbers of claims with texts.
-    """
-
-    do = 'write {"1": "because ..."}'
-    document = read_json_object(path, DOING, do_this=do)
-    if not all(key.isdigit() and isinstance(value, str) for key, value in document.items()):
-        raise InputError(DOING, str(path), "a key that is no number, or a value that is no text", do)
-    return {int(key): str(value) for key, value in document.items()}

@@ -19,8 +19,9 @@ from alpasim_plugin.run_folder.sides import Row, by_renderer
 from evaluators.report.ci import cell_text, metric_label
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, metric_rows, p_text, pair_rows
-from evaluators.statistics.intervals import Interval
-from evaluators.statistics.paired import compare, paired_sides
+from evaluators.statistics.bounded import mean_bounds
+from evaluators.statistics.intervals import Interval, cluster_means
+from evaluators.statistics.paired import Pairs, compare, paired_sides
 from evaluators.statistics.summary import aggregate_sides
 
 TABLE = "closed-loop"  # of the paper
@@ -80,13 +81,21 @@ class Driven(Measured):
             return Interval(entry["mean"], reason=entry.get("ci95_reason", ""))
         return Interval(entry["mean"], entry["mean"] - entry["ci95"], entry["mean"] + entry["ci95"], method="1.96 sigma / sqrt(N)")
 
-    def difference(self, metric: str, first: str, second: str) -> Difference:
+    def difference(self, metric: str, first: str, second: str, share: float = 0.0) -> Difference:
         """Return the paired difference of two renderers with scenes as the unit; see `evaluators.statistics.paired.compare`.
+
+        Of what is left of the second's rate without a share of it the bounds are those of `evaluators.statistics.bounded`, which hold for
+        scenes that were not drawn as well.
 
         Raises:
             EvaluatorError: They share fewer than two rollouts.
         """
         self._shared(metric, first, second)
+        if share:
+            pairs = Pairs(self.sides[first], self.sides[second], metric)
+            means, _ = cluster_means(pairs.mine - (1 - share) * pairs.base, pairs.scenes)
+            bounds = mean_bounds(means, share - 1.0, 1.0)
+            return Difference(metric, first, f"{1 - share:.3g} of {second}", float(means.mean()), *bounds, None, len(means), 0)
         found = compare(self.sides[first], self.sides[second], KNOWN.info(metric), second)
         low, high = found["ci95"] or (None, None)
         favours = {"better": 1, "worse": -1}.get(found["difference"], 0)

@@ -3,30 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.lab.paper import wrong_map
 from alpasim_plugin.lab.paper.appearance import appearance_section
-from alpasim_plugin.lab.paper.claims import OURS
+from alpasim_plugin.lab.paper.bubbles import plot_bubbles
+from alpasim_plugin.lab.paper.claims import MARGINS, OURS
 from alpasim_plugin.lab.paper.closed_loop import Driven, closed_loop_section, plot_closed_loop
 from alpasim_plugin.lab.paper.cost import Cost, cost_section, plot_cost
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.position import DRAWN, DRIFTING, by_position, distance_by_position, drift, with_half
 from alpasim_plugin.lab.paper.published import Published
+from alpasim_plugin.lab.paper.regime import RegimeClip, plot_regime, regime_section
 from alpasim_plugin.lab.paper.tables import differences, markdown_table, paper_against_ours, verdicts
 from alpasim_plugin.lab.paper.training import WITHIN, TrainedArm, training_section
 from alpasim_plugin.lab.paper.transfer import transfer_section
-from alpasim_plugin.lab.paper.verdict import in_both, judge_claims
+from alpasim_plugin.lab.paper.verdict import Evidence, Judged, in_both, judge_claims
 from alpasim_plugin.lab.video_metrics.charts import plot_by_frame
 from alpasim_plugin.lab.video_metrics.summary import summarise
 
 WRONG_MAP, POSITION, DRIFT, COST = "wrong-map.png", "by-position.png", "drift.png", "cost.png"  # figures beside the document
-CLOSED_LOOP = "closed-loop.png"
+CLOSED_LOOP, REGIME, BUBBLES = "closed-loop.png", "regime.png", "bubbles.png"
 PERIOD_MS = 100.0  # between frames of the pairs
 TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a
 block waits for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
+"""
+JUDGED = """A claim is a sentence of the paper as comparisons over the same clips or scenes; a difference below the metric's margin does
+not count. *Power* is the chance that an interval as wide as that of the weakest comparison decides for the claim where the truth is
+the margin (for equality: no difference). `not trained`: an arm of a decided comparison has no better mean than the raw render that it
+was given, the negative control. Where one arm trains its decoder, the other must have too (`V9, decoder trained`). A claim on histories
+is judged only where the truth as history is worth the margin. Dropped: "distilled arms are close to OmniDreams at one step over 900
+frames", which held here because a tenth of PSNR is 2.2 dB.
 """
 BASELINE = "3dgs"
 LEADS = (OURS, "onefixer")  # whose paired differences with all others are shown
@@ -63,6 +72,8 @@ class Findings:
         cost: Quality against training time; None where it was not measured.
         training: How the arms were trained; empty where nothing is known of it.
         equal_time: The same arms trained with equal core-minutes; None where they were not measured.
+        regime: Clips of the regime map.
+        recorded: PROTOCOL -> what an earlier comparison left, by which claims are judged that nothing here judges.
     """
 
     measured: Mapping[str, Measured]
@@ -73,6 +84,14 @@ class Findings:
     cost: Cost | None = None
     training: Sequence[TrainedArm] = ()
     equal_time: EqualTime | None = None
+    regime: Sequence[RegimeClip] = ()
+    recorded: Mapping[str, Evidence] = field(default_factory=dict)
+
+    @property
+    def judged(self) -> tuple[Judged, ...]:
+        """Verdicts by these measurements, or by the record where these leave a claim without one."""
+        pairs = zip(judge_claims(self.measured), judge_claims(self.recorded), strict=True)
+        return tuple(old if new.verdict == "not measured" else new for new, old in pairs)
 
 
 @dataclass(frozen=True)
@@ -90,13 +109,12 @@ class EqualTime:
     taken: Sequence[str] = ()
 
 
-def document(published: Published, found: Findings, reasons: Mapping[int, str], command: str) -> str:
+def document(published: Published, found: Findings, command: str) -> str:
     """Return the document.
 
     Args:
         published: The paper's numbers.
         found: What was measured.
-        reasons: Claim -> why it comes out as it does here.
         command: That makes it.
     """
     measured, rows = found.measured, found.rows
@@ -113,10 +131,18 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
         "Core-minutes to quality": "" if found.cost is None else cost_section(found.cost, COST),
         "Training": training_section(found.training),
         "Equal core-minutes": "" if found.equal_time is None else _equal_time(published, found.equal_time),
-        "The paper's claims": _verdicts(found, reasons),
     }
     parts += [f"## {heading}\n\n{text or 'Not run.'}\n" for heading, text in sections.items()]
-    return "\n".join(parts)
+    return "\n".join(parts) + "\n" + claims_document(found)
+
+
+def claims_document(found: Findings) -> str:
+    """Return the sections on the paper's claims, their picture, and the regime map."""
+    sections = {
+        "The paper's claims": f"{JUDGED}\n{margins()}\n{_verdicts(found)}\n![Quality, consistency and latency]({BUBBLES})\n",
+        "The regime map": regime_section(found.regime, REGIME),
+    }
+    return "\n".join(f"## {heading}\n\n{text or 'Not run.'}\n" for heading, text in sections.items())
 
 
 def _tables(published: Published, measured: Mapping[str, Measured], tables: Sequence[tuple[str, str, str]], level: str = "##") -> list[str]:
@@ -141,16 +167,21 @@ def _equal_time(published: Published, found: EqualTime) -> str:
     return "\n".join((EQUAL_TIME + taken, training_section(found.training), *_tables(published, found.measured, tables, "###")))
 
 
-def _verdicts(found: Findings, reasons: Mapping[int, str]) -> str:
+def _verdicts(found: Findings) -> str:
     """Return the verdicts, and below them those that both budgets give; a protocol that only one was measured under counts for both."""
-    judged = judge_claims(found.measured)
-    text = verdicts(judged, reasons)
+    judged = found.judged
     if found.equal_time is None:
-        return text
+        return verdicts(judged)
     again = judge_claims({**found.measured, **found.equal_time.measured})
-    rows = [[str(a.claim.number), a.verdict, b.verdict, f"**{in_both(a.verdict, b.verdict)}**"] for a, b in zip(judged, again, strict=True)]
+    pairs = enumerate(zip(judged, again, strict=True), start=1)
+    rows = [[str(i), a.verdict, b.verdict, f"**{in_both(a.verdict, b.verdict)}**"] for i, (a, b) in pairs]
     table = markdown_table(["claim", "updates as in the paper", "equal core-minutes", "in both"], rows)
-    return f"{text}\n### Under both budgets\n\n{BOTH}\n{table}"
+    return f"{verdicts(judged)}\n### Under both budgets\n\n{BOTH}\n{table}"
+
+
+def margins() -> str:
+    """Return the margins of all metrics in one line."""
+    return f"Margins: {', '.join(f'`{name}` {value:g}' for name, value in MARGINS.items())}.\n"
 
 
 def _drives(found: Findings) -> list[Driven]:
@@ -161,6 +192,10 @@ def draw_figures(found: Findings, folder: Path) -> None:
     """Write the document's figures beside it: those of the protocols that were run."""
     if drives := _drives(found):
         plot_closed_loop(drives, folder / CLOSED_LOOP)
+    if found.regime:
+        plot_regime(found.regime, folder / REGIME)
+    if (cycle := found.measured.get("cycle") or found.recorded.get("cycle")) is not None:
+        plot_bubbles(cycle, folder / BUBBLES)
     if found.shifted is not None:
         wrong_map.plot(*found.shifted, folder / WRONG_MAP)
     if found.cost is not None:

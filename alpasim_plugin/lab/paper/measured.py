@@ -47,6 +47,16 @@ class Difference:
     n: int
     favours: int
 
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """95 % bounds; of whole sets those of the normal distribution that has the p-value of the swaps; None where nothing says so."""
+        if self.low is not None and self.high is not None:
+            return self.low, self.high
+        if self.p_value is None or not 0.0 < self.p_value < 1.0 or self.difference == 0.0:
+            return None
+        half = abs(self.difference) * float(scipy.special.ndtri(1 - ALPHA / 2) / scipy.special.ndtri(1 - self.p_value / 2))
+        return self.difference - half, self.difference + half
+
 
 class Measured:
     """Values of clips and features of clips, by arm.
@@ -102,8 +112,17 @@ class Measured:
             return Interval(frechet_distance(np.concatenate(made), np.concatenate(true)))
         return t_interval([self.values[arm][clip][metric] for clip in clips], "clips")
 
-    def difference(self, metric: str, first: str, second: str) -> Difference:
+    def compares(self, metric: str, first: str, second: str) -> bool:
+        """Whether two arms have a metric on at least two common clips."""
+        return len(set(self.clips(first, metric)) & set(self.clips(second, metric))) >= 2
+
+    def difference(self, metric: str, first: str, second: str, share: float = 0.0) -> Difference:
         """Return the paired difference of two arms.
+
+        Args:
+            metric: Which; of whole sets only without a share.
+            first, second: Arms.
+            share: Of the second's value, 0 to 1, that is taken off before.
 
         Raises:
             EvaluatorError: They share fewer than two clips.
@@ -115,7 +134,8 @@ class Measured:
             difference = test.difference if first <= second else -test.difference
             favours = better * int(np.sign(difference)) if test.p_value < ALPHA else 0
             return Difference(metric, first, second, difference, None, None, test.p_value, len(clips), favours)
-        found = t_interval([self.values[first][clip][metric] - self.values[second][clip][metric] for clip in clips], "clips")
+        left = 1.0 - share
+        found = t_interval([self.values[first][clip][metric] - left * self.values[second][clip][metric] for clip in clips], "clips")
         favours = 0
         if found.low is not None and found.high is not None and not found.low <= 0.0 <= found.high:
             favours = better * int(np.sign(found.centre))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.lab.learned_metrics.facts import FD_16
-from alpasim_plugin.lab.learned_metrics.frechet import frechet_distance
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.tables import markdown_table
 from alpasim_plugin.lab.video_metrics.facts import DRIFT, PSNR
@@ -70,20 +69,27 @@ def distance_by_position(measured: Measured, frames: int) -> str:
         measured: With vectors of 16 frames each, one after the other from a clip's first frame.
         frames: Of the shortest clip.
     """
+    found = windows(measured, frames)
+    lines = [[arm, *(f"{each.mean(arm, FD_16).centre:.1f}" for each in found)] for arm in measured.arms]
+    return markdown_table(_head(FD_16, [FEATURE_FRAMES * (edge // FEATURE_FRAMES) for edge in edges(frames)]), lines) if found else ""
+
+
+def windows(measured: Measured, frames: int) -> list[Measured]:
+    """Return ``fd_syn_16`` in windows of 93 frames, in order; none without such features."""
     if FD_16 not in measured.set_metrics:
-        return ""
-    borders = [edge // FEATURE_FRAMES for edge in edges(frames)]
-    lines = []
-    for arm in measured.arms:
-        clips = measured.clips(arm, FD_16)
-        cells = []
-        for low, high in pairwise(borders):
-            made, true = (
-                np.concatenate([measured.features[side][clip][FD_16][low:high] for clip in clips]) for side in (arm, measured.reference)
-            )
-            cells.append(f"{frechet_distance(made, true):.1f}")
-        lines.append([arm, *cells])
-    return markdown_table(_head(FD_16, [FEATURE_FRAMES * border for border in borders]), lines)
+        return []
+    return [
+        Measured(
+            {arm: {} for arm in measured.values},
+            {
+                arm: {clip: {FD_16: kinds[FD_16][low:high]} for clip, kinds in clips.items() if FD_16 in kinds}
+                for arm, clips in measured.features.items()
+            },
+            measured.reference,
+            measured.seed,
+        )
+        for low, high in pairwise(edge // FEATURE_FRAMES for edge in edges(frames))
+    ]
 
 
 def drift(measured: Measured, rows: Sequence[Mapping[str, Any]]) -> str:

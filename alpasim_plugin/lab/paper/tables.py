@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from alpasim_plugin.lab.paper.measured import Difference, Measured
 from alpasim_plugin.lab.paper.published import PaperMetric, Published
-from alpasim_plugin.lab.paper.verdict import Judged, Result
+from alpasim_plugin.lab.paper.verdict import ORACLE, Judged
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.lab.video_metrics.table import DIGITS, SCALE
 
@@ -82,48 +82,35 @@ def difference_text(found: Difference) -> str:
     return f"**{text}**" if found.favours else text
 
 
-def verdicts(judged: Sequence[Judged], reasons: Mapping[int, str]) -> str:
-    """Return a line for every claim, and below it a paragraph for each that does not hold: which comparisons, and why.
-
-    Args:
-        judged: All claims.
-        reasons: Number of a claim -> why it comes out as it does here, written by whoever looked; nothing is made up for the others.
-    """
-    rows = [[str(one.claim.number), one.claim.text, one.claim.where, f"**{one.verdict}**", _tally(one)] for one in judged]
-    out = [markdown_table(["", "claim", "where", "verdict", "comparisons"], rows)]
-    for one in judged:
-        if one.verdict == "not measured":
-            missing = sorted({result.missing for result in one.results if result.missing})
-            out.append(
-                f"**Claim {one.claim.number}** was not measured: {'; '.join(missing[:6])}{' and others' if len(missing) > 6 else ''}.\n"
-            )
-            continue
-        telling = [
-            r for r in one.results if r.outcome == ("for" if one.verdict == "holds" else "against" if one.count("against") else "open")
-        ]
-        telling.sort(key=_refuting)
-        lines = "".join(f"- {_sentence(result)}\n" for result in telling[:8])
-        more = f"- and {len(telling) - 8} more\n" if len(telling) > 8 else ""
-        why = f"\n{reasons[one.claim.number]}\n" if one.claim.number in reasons else ""
-        out.append(f"**Claim {one.claim.number}: {one.verdict}.**\n\n{lines}{more}{why}")
-    return "\n".join(out)
+def verdicts(judged: Sequence[Judged]) -> str:
+    """Return a line for every claim: its verdict, how its comparisons came out, what they could have shown, and the one that tells most."""
+    rows = []
+    for i, one in enumerate(judged, start=1):
+        power = "-" if one.power is None else f"{100 * one.power:.0f} %"
+        rows.append([str(i), one.claim.text, one.claim.where, f"**{one.verdict}**", _tally(one), power, _telling(one)])
+    head = ["", "claim", "where", "verdict", "comparisons", "power", "what tells most"]
+    return markdown_table(head, rows)
 
 
 def _tally(one: Judged) -> str:
-    names = ("for", "against", "open", "not measured")
+    names = ("for", "against", "open", "not trained", "not measured")
     return ", ".join(f"{count} {name}" for name in names if (count := one.count(name)))  # type: ignore[arg-type]
 
 
-def _sentence(result: Result) -> str:
-    comparison = result.comparison
-    assert result.difference is not None
-    corrected = f", corrected p {result.refutes:.2g}" if result.outcome == "against" and result.refutes is not None else ""
-    arms = f"{comparison.first} minus {comparison.second}"
-    return f"{comparison.protocol}, `{comparison.metric}`: {arms} {difference_text(result.difference)}{corrected}"
-
-
-def _refuting(result: Result) -> float:
-    return 1.0 if result.refutes is None else result.refutes
+def _telling(one: Judged) -> str:
+    """Return what decides a claim: the oracle's gain, what is missing, or the comparison that is hardest to reconcile with it."""
+    if one.verdict == "no room for a history" and one.oracle is not None:
+        return f"the truth as history gains {difference_text(one.oracle)} dB"
+    if one.verdict == "not measured":
+        missing = list(dict.fromkeys(r.missing for r in one.results if r.outcome == "not measured"))
+        return f"{'; '.join(missing[:2]) or f'{ORACLE} of {one.claim.comparisons[0].first}'}{' and others' if len(missing) > 2 else ''}"
+    wanted = {"does not hold": "against", "undecided": "open", "holds": "for"}.get(one.verdict, one.verdict)
+    telling = min((r for r in one.results if r.outcome == wanted), key=lambda r: (1.0 if r.refutes is None else r.refutes, r.power or 0.0))
+    assert telling.difference is not None
+    corrected = f", corrected p {telling.refutes:.2g}" if wanted == "against" and telling.refutes is not None else ""
+    found = telling.difference
+    aside = f" ({telling.missing})" if telling.missing else ""
+    return f"`{found.metric}`: {found.first} minus {found.second} {difference_text(found)}{corrected}{aside}"
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -83,6 +83,7 @@ _ALL = (
     PixelVariant("V8", (replace(FULL, history="redenoised"),), "history noised and denoised again"),
     PixelVariant(DEPLOYED, (FULL,), "OneFixer"),
     PixelVariant("V9-still", (replace(FULL, source="render"),), "OneFixer, without noise in holes"),
+    PixelVariant("V3b-still", (replace(FULL, source="render", history="clean"),), "the same on clean history"),
 )
 PIXEL_VARIANTS: Mapping[str, PixelVariant] = MappingProxyType({variant.name: variant for variant in _ALL})
 

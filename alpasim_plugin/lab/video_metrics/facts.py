@@ -6,6 +6,7 @@ from alpasim_plugin.lab.learned_metrics.facts import CLIP_FACTS, EXTERNAL_FACTS,
 from evaluators.metrics import METRICS, MetricInfo
 
 PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
+WARP_ROAD = "warp_l1_late_road"
 DRIFT = "drift_psnr_db"
 JOD = "cvvdp_jod"
 GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
@@ -22,6 +23,7 @@ FACTS: dict[str, MetricInfo] = {
     "dists": MetricInfo("", "lower", "mean", "DISTS with VGG-16, full resolution"),
     WARP: MetricInfo("", "lower", "mean", "change from frame to frame beyond the video's own motion"),
     WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
+    WARP_ROAD: MetricInfo("", "lower", "mean", "that of the road alone, as the paper has it"),
     DRIFT: MetricInfo("dB", "higher", "mean", "PSNR of the last 50 frames minus that of frames 50 to 100"),
     **{
         name: MetricInfo(

@@ -173,7 +173,7 @@ def test_an_arm_with_several_numbers_of_steps_takes_each_though_its_bundle_names
         (["--arms", "nowhere"], "no such folder"),
         (["--equal-time", "nowhere"], "--equal-time nowhere"),
         (["--drives", "."], "run.json"),
-        (["--reasons", "why.json"], "no such file"),
+        (["--record", "paper.json"], "no such file"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(
