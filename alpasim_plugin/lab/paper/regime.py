@@ -28,6 +28,7 @@ AXES: Mapping[str, tuple[float, ...]] = {  # borders of bins
 }
 LEAST_CLIPS = 5  # that a bin needs
 DPI = 110
+DARK = 0.6  # share of the largest value above which a colour needs light text
 HOW = f"""*Room*: PSNR of `{PER_FRAME}`, rolled out without references, with the truth in place of its own last output, minus that on its
 own history. No training on histories can gain more there. *Paid*: `{TRAINED_ON_OWN}` (trained on its own history) minus
 `{TRAINED_ON_CLEAN}` (trained on the clean frames before), both on their own history, mean over seeds of training; `-` without such arms.
@@ -164,7 +165,6 @@ def _text(one: Bin) -> str:
 def plot_regime(clips: Sequence[RegimeClip], path: Path) -> None:
     """Draw the room in the crossed bins, a panel for each length of the rollout, and write a PNG; bold is shown."""
     found = bins(clips, room, crossed=True)
-    most = max((abs(one.gain_db.centre) for one in found.values()), default=0.0) or 1.0
     rows, columns, panels = (len(borders) - 1 for borders in AXES.values())
     most = max((abs(one.gain_db.centre) for one in found.values()), default=0.0) or 1.0
     figure = Figure(figsize=(3.4 * panels + 0.8, 3.6), layout="constrained")
@@ -177,7 +177,8 @@ def plot_regime(clips: Sequence[RegimeClip], path: Path) -> None:
             grid[i, j] = one.gain_db.centre
             half = ((one.gain_db.high or 0) - (one.gain_db.low or 0)) / 2
             text = f"{one.gain_db.centre:+.2f}\n±{half:.2f}, {one.clips}"
-            ax.text(j, i, text, ha="center", va="center", fontsize=8, weight="bold" if one.shown else "normal")
+            colour = "white" if abs(one.gain_db.centre) > DARK * most else "black"
+            ax.text(j, i, text, ha="center", va="center", fontsize=8, weight="bold" if one.shown else "normal", color=colour)
         image = ax.imshow(grid, cmap="RdBu", vmin=-most, vmax=most, aspect="auto", origin="lower")
         ax.set_xticks(range(columns), [_label(1, j) for j in range(columns)], fontsize=8)
         ax.set_yticks(range(rows), [_label(0, i) for i in range(rows)] if k == 0 else [""] * rows, fontsize=8)
