@@ -26,7 +26,7 @@ def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["onefixer", "onefixer-m", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"])
+@pytest.mark.parametrize("name", ["onefixer", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"])
 def test_every_fixer_has_settings_that_load(name: str) -> None:
     assert name in names("fixer")
     assert isinstance(fixer_settings(name), FixerSettings)

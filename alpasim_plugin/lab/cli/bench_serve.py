@@ -22,7 +22,7 @@ Examples:
 
 - `simrun bench serve --soak 10000 --size 128x80 --history-mb 64`: many frames at constant memory
 
-- `simrun bench serve --device cuda --renderer onefixer-m --size 1920x1080`
+- `simrun bench serve --device cuda --renderer onefixer --size 1920x1080`
 """
 
 

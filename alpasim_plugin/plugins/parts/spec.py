@@ -233,7 +233,6 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
     },
     "fixer": {
         "onefixer": (_PER_FRAME, "one-step causal generator in pixels, frame by frame, for a CPU"),
-        "onefixer-m": (_PER_FRAME, "the same at three times the work, for bfloat16 instructions or a GPU"),
         "nearest": ("alpasim_plugin.fixers.nearest:NearestFixer", "the nearest recorded frame, warped into the view, without a network"),
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
