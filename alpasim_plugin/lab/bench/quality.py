@@ -25,7 +25,7 @@ from alpasim_plugin.plugins.interfaces import Fixer
 from alpasim_plugin.plugins.parts import PartSpec
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 2  # of what a row holds and how it is measured; part of its key
+VERSION = 3  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 
