@@ -94,8 +94,9 @@ def broken_renderers() -> list[str]:
 def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequence[str], progress: Callable[[], Progress]) -> SelfTest:
     """Drive the suite behind the reference and every broken renderer and judge each pair by the gate.
 
-    The gate's rules apply unchanged, except that the reference is `REFERENCE` and that ``min_scenes`` is at most the suite's size. As a
-    control the reference is compared with itself under another seed: a gate that fails everything fails its test.
+    The gate's rules apply unchanged, except that the reference is `REFERENCE`, that ``min_scenes`` is at most the suite's size and that
+    its scenes are all that is asked about. As a control the reference is compared with itself under another seed: a gate that fails
+    everything fails its test.
 
     Args:
         spec: The gate under test.
@@ -125,6 +126,7 @@ def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequ
 
 def _judge(spec: GateSpec, rows: Sequence[Row], name: str, n_scenes: int) -> GateVerdict:
     fields = {"renderers": (name,), "baseline": REFERENCE, "min_scenes": min(spec.min_scenes, n_scenes), "max_failed": 0.0}
+    fields["population"] = "suite"
     only = [row for row in rows if row["renderer"] in (REFERENCE, name)]
     return judge(only, spec.model_copy(update=fields))
 

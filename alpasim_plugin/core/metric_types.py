@@ -32,6 +32,7 @@ class MetricInfo:
         invalid: When a step has no value, for docs/metrics.md.
         reference: Which point is measured, and in which frame, for docs/metrics.md.
         curve: Place among the curves over time that a viewer shows first, from 1; 0: only when asked for.
+        event: Flag that counts what a distance does not: a scene's difference counts up to a cap, so it decides only together with it.
     """
 
     unit: str
@@ -51,6 +52,7 @@ class MetricInfo:
     invalid: str = "never"
     reference: str = ""
     curve: int = 0
+    event: str = ""
 
     @property
     def words(self) -> str:

@@ -218,7 +218,8 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
         invalid=_NOT_LOOKED_FOR,
     ),
     "min_distance_to_obstacle_m": _metres(
-        "least plan-view gap between the ego and any actor", "higher", "min", margin=0.25, curve=3, reference=FOOTPRINT,
+        "least plan-view gap between the ego and any actor", "higher", "min", margin=0.25, curve=3, event="collision_any",
+        reference=FOOTPRINT,
         formula="least distance from `F` to any actor's rectangle, 0 on touch", invalid="steps with no other actor",
     ),
     "contact_time_s": MetricInfo(
@@ -252,23 +253,23 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
         formula="distance from `F` to the border of the union of nearby lanes if that contains `F`, else 0", invalid=_NO_LANES,
     ),
     "dist_to_gt_trajectory": _metres(
-        "distance of the ego centre from the recorded path", "lower", "max", margin=0.25, reference=CENTRE,
+        "distance of the ego centre from the recorded path", "lower", "max", margin=0.25, event="offroad", reference=CENTRE,
         formula="distance from `c` to `P`",
     ),
     "lateral_distance_m": _metres(
         "mean distance to the side of the recorded path, which goes straight on beyond its ends", "lower", "mean", is_headline=True,
-        label="lateral distance", margin=0.1, reference=CENTRE, invalid=_SHORT,
+        label="lateral distance", margin=0.1, event="offroad", reference=CENTRE, invalid=_SHORT,
         formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within "
         "0.5 m of an end is standing): driving past the end is no distance",
     ),
     "route_distance_m": _metres(
         "the paper's: mean distance from the recorded path; driving past its end counts as distance", "lower", "mean",
-        label="route distance", margin=0.1, reference=CENTRE,
+        label="route distance", margin=0.1, event="offroad", reference=CENTRE,
         formula="distance from `c` to `P` as it stands: the paper's route distance, which [charges for driving past the end](presets.md)",
     ),
     "lateral_bias_m": _metres(
         "mean signed distance to the side of the recorded path, left of it positive", "none", "mean", limits=_SIGNED, margin=0.1, curve=1,
-        reference=CENTRE, formula="lateral distance with sign: left of `P` positive", invalid=_SHORT,
+        event="offroad", reference=CENTRE, formula="lateral distance with sign: left of `P` positive", invalid=_SHORT,
     ),
     "lateral_dist_to_gt_trajectory": _metres(
         "distance of the ego centre from the recorded path, which goes straight on at its far end", "lower", "max", reference=CENTRE,

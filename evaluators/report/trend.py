@@ -15,6 +15,7 @@ from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, columns_o
 from alpasim_plugin.run_folder.sides import RendererRows, Row
 from evaluators.report.runs import CHECK, RunEntry, as_time
 from evaluators.statistics.paired import compare
+from evaluators.statistics.verdicts import difference
 
 # Options that change nothing in a rollout or its scores: what is kept, what is compared, and how many processes work.
 NO_EFFECT = frozenset(("workers", "threads_per_worker", "baseline", "video", "preset", "fixer"))  # the last two stand elsewhere
@@ -187,8 +188,8 @@ class Step:
 
     @property
     def moved(self) -> bool:
-        """Tell whether a difference is shown: the 95 % interval leaves out zero and the test rejects."""
-        return bool(self.entry["difference"] != "none shown")
+        """Tell whether these scenes, which both runs drove, show a difference: the 95 % interval leaves out zero and the test rejects."""
+        return difference(self.entry["ci95"], self.entry["p_value"], self.entry["direction"]) != "none shown"
 
     @property
     def unexplained(self) -> bool:

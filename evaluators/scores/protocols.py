@@ -50,14 +50,27 @@ def _route(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> tuple[OnR
     return on_route(path, recorded.t_us, centre.t_us, centre.xyz[:, :2] - origin[:2]), on_route(path, recorded.t_us, centre.t_us, there)
 
 
-def _progress(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> Part:
+def _progress(rollout: RolloutLog, preset: Preset, centre: Trajectory, ratio: Callable[[float, float], float]) -> Part:
+    """Return the ratio of the metres along the recorded path that the ego and that the recording made in the same time."""
     ego, expert = _route(rollout, preset, centre)
     made = [float(one.along_m[-1] - one.along_m[0]) for one in (ego, expert)]
-    return nuplan.progress_ratio(made[0], made[1]) if ego.length_m > 0 else NO_PATH
+    return ratio(made[0], made[1]) if ego.length_m > 0 else NO_PATH
+
+
+def ego_progress(ego_m: float, reference_m: float) -> float:
+    """Return NAVSIM's ego progress: the share of the greater of both, and 1 where neither makes more than `LEAST_PROGRESS_M`.
+
+    NAVSIM's reference is a drive of PDM-Closed in the same scene; here it is the recorded drive.
+
+    >>> ego_progress(30.0, 40.0), ego_progress(50.0, 40.0), ego_progress(1.0, 5.0), ego_progress(-3.0, 40.0)
+    (0.75, 1.0, 1.0, 0.0)
+    """
+    most = max(ego_m, reference_m)
+    return max(ego_m, 0.0) / most if most > LEAST_PROGRESS_M else 1.0
 
 
 def _nuplan(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> Mapping[str, Part]:
-    drive, made = Judged(rollout, scene, preset, centre), _progress(rollout, preset, centre)
+    drive, made = Judged(rollout, scene, preset, centre), _progress(rollout, preset, centre, nuplan.progress_ratio)
     return {
         "no_at_fault_collision": drive.contact(),
         "drivable_area": drive.drivable(nuplan.OFF_AREA_M),
@@ -77,7 +90,7 @@ def _navsim(rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajector
         "dac": drive.drivable(MARGIN_M),
         "ddc": drive.direction(),
         "tlc": drive.traffic_lights(),
-        "ep": "the progress of PDM-Closed in the same scene",
+        "ep": _progress(rollout, preset, centre, ego_progress),
         "ttc": drive.time_to_collision(),
         "lk": drive.lane_keeping(),
         "hc": drive.comfort(),
@@ -124,6 +137,7 @@ def _weighted(values: Values, weights: Values) -> float:
     return sum(weight * values[name] for name, weight in weights.items()) / sum(weights.values())
 
 
+LEAST_PROGRESS_M = 5.0
 PDMS = {"ep": 5.0, "ttc": 5.0, "hc": 2.0}
 EXTENDED_COMFORT = {"accel": 0.7, "jerk": 0.5, "yaw_rate": 0.1, "yaw_accel": 0.1}  # root mean squares: m/s2, m/s3, rad/s, rad/s2
 APART_US, REACH_US, PLAN_STEP_US = 500_000, 4_000_000, 100_000

@@ -23,7 +23,7 @@ PARTS = {  # benchmark -> part -> what it says: a share, the higher the better, 
     },
     "navsim": {
         "nc": _FAULT, "dac": "never off the drivable surface", "ddc": _AGAINST, "tlc": "no red light is passed",
-        "ep": "progress as a share of that of PDM-Closed", "ttc": _TTC,
+        "ep": "progress as a share of the greater of the ego's and the recording's, for PDM-Closed's", "ttc": _TTC,
         "lk": "never more than 0.5 m beside the middle of the lane for 2 s", "hc": _COMFORT,
         "ec": "share of plans that move as the one 0.5 s before meant to",
     },

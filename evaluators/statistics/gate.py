@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +19,8 @@ from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import PRESETS
 from evaluators.statistics.arms import Arm, Base, as_policy, base_named, short_name, usual_base
 from evaluators.statistics.baselines import of_policy, policies_of
-from evaluators.statistics.paired import compare
-from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, worst
+from evaluators.statistics.paired import compare, reach_of
+from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, scenes_without_event, worst
 
 DOING, DOING_JUDGE = "reading a gate", "judging a run"
 LIBRARY = Path(__file__).resolve().parents[2] / "configs" / "gates"
@@ -57,6 +57,9 @@ class GateSpec(_Strict):
     )
     renderers: tuple[str, ...] = Field(default=(), description="Renderers to judge; none: all but the baseline.")
     min_scenes: int = Field(default=2, ge=2, description="Fewest scenes with a pair that a paired verdict may stand on.")
+    population: Literal["scenes", "suite"] = Field(
+        default="scenes", description="suite: these scenes are all that is asked about; else they are draws, and others may be far worse."
+    )
     max_failed: float = Field(default=0.0, ge=0.0, lt=1.0, description="Share of rollouts that may fail to run.")
     max_missing: float = Field(default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric.")
     metrics: dict[str, MetricRule] = Field(min_length=1, description="Metric to rule.")
@@ -195,16 +198,18 @@ def judge_sides(
         side = sides[arm.policy][arm.renderer]
         other = _partner(arm, base, there, stored is not None) if has_margin else arm
         behind = as_policy(there[other.policy][other.renderer], arm.policy) if has_margin else side
+        found: dict[str, Check] = {}
         for wanted, rule in spec.metrics.items():
             metric = known.info(wanted)
             if rule.margin is not None:
                 name = short_name(other, arm)
                 against = name if stored is None else f"{name} of {stored_name or 'the baseline'}"  # else it reads "clean against clean"
-                checks.append(_margin(side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec))
+                found[wanted] = _margin(side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec)
             if rule.max is not None or rule.min is not None:
                 checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
-    found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
-    outcome = worst([outcome_of_failures(failures, spec.max_failed), *found])
+        checks += [_with_event(check, found, known) if spec.population == "scenes" else check for check in found.values()]
+    causes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
+    outcome = worst([outcome_of_failures(failures, spec.max_failed), *causes])
     kind = "" if base is None or (base.renderer and base.policy) else "renderer " if base.renderer else "policy "
     name = stored_name if base is None or stored is not None else f"{kind}{base.name} of the same run"
     return GateVerdict(outcome, tuple(checks), failures, name)
@@ -268,17 +273,29 @@ def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored:
 def _margin(
     side: Side, base: Side, variant: tuple[str, str], name: str, against: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec
 ) -> Check:
-    entry = compare(side, base, metric, name, rule.margin or 0.0)
+    entry = compare(side, base, metric, name, rule.margin or 0.0, sampled=spec.population == "scenes")
     planned = entry["n_cells"] + entry["n_missing"]
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
     said = _paired_text(entry, metric.name, variant[0], against)
+    least = scenes_without_event(entry["margin"], reach_of(metric, entry["margin"])) or 0
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
         said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
+    elif cause == "undecided" and entry["n_scenes"] < least:
+        said += f"; fewer than {least} scenes cannot exclude harm in others"
     elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
         cause = "undecided"
         said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
     return Check(*variant, metric.name, "margin", cause, said, entry, rule.must_decide)
+
+
+def _with_event(check: Check, found: Mapping[str, Check], known: MetricTable) -> Check:
+    """Return the check of a distance, which passes only together with the event that counts what lies beyond its cap."""
+    event = known.info(check.metric).event
+    if check.cause != "pass" or not event or (event in found and found[event].cause == "pass"):
+        return check
+    why = f"{event} is {found[event].entry['verdict']}" if event in found else f"the gate has no margin for {event}"
+    return replace(check, cause="undecided", text=f"{check.text}, but a distance decides only together with its event: {why}")
 
 
 def _limit(side: Side, variant: tuple[str, str], metric: MetricInfo, rule: MetricRule) -> Check:

@@ -32,6 +32,7 @@ from evaluators.statistics.verdicts import LEAST_SCENES, REACH, difference, harm
 Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
 
 LISTED = 50  # missing cells named per metric; the count is always whole
+UNDONE_BY = {"non-inferior": "worse", "better": "worse", "worse": "better"}  # what is seen -> what scenes that were not drawn may be
 NO_PAIR = "no scene-seed cell has this metric on both sides"
 
 
@@ -112,7 +113,7 @@ def base_pairs(
 
 
 def compare(
-    here: Side, there: Side, metric: MetricInfo, baseline: str, margin: float | None = None, listed: int = LISTED
+    here: Side, there: Side, metric: MetricInfo, baseline: str, margin: float | None = None, listed: int = LISTED, sampled: bool = True
 ) -> dict[str, Any]:
     """Compare one metric of two renderers on their shared cells.
 
@@ -122,11 +123,12 @@ def compare(
         baseline: What to call ``there``.
         margin: How much worse is accepted, in the metric's unit; None: its own margin.
         listed: How many missing cells to name.
+        sampled: Scenes are draws from a population. False: they are all that is asked about, and no unseen one needs a guard.
 
     Returns:
         ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
-        and its ``method``; ``guarded`` (the bounds that non-inferior, and of rates and shares worse, must hold for, or None:
-        `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference``
+        and its ``method``; ``guarded`` (the bounds that a verdict and a difference must hold for as well, or None, with which nothing is
+        decided: `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference``
         (better, worse, none shown; independent of the margin); ``more_scenes`` (how many would decide an undecided verdict, else None);
         ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
         exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
@@ -175,27 +177,33 @@ def compare(
     entry["guarded"], entry["spread"] = guarded, scaled(means)[1] * float(np.std(scaled(means)[0], ddof=1))
     entry["p_value"], entry["test"] = p_value(means, metric.is_flag)
     notes = [interval.note] if interval.note else []
-    shown = _both(interval.bounds, guarded) if np.isfinite(metric.difference_range).all() else interval.bounds
-    if len(means) >= LEAST_SCENES:
-        entry["verdict"] = verdict(shown, entry["p_value"], margin, metric.direction, guarded)
-        entry["difference"] = difference(interval.bounds, entry["p_value"], metric.direction)
-    else:
+
+    def said(*bounds: list[float] | None) -> tuple[str, str]:
+        p = entry["p_value"]
+        return verdict(bounds[0], p, margin, metric.direction), difference(bounds[-1], p, metric.direction)
+
+    seen, both = interval.bounds, _both(interval.bounds, guarded) if sampled else interval.bounds
+    alone, shown = said(seen), said(both, seen if metric.is_flag else both)  # a flag's sign test needs no bound of what was not drawn
+    if len(means) < LEAST_SCENES:
         notes.append(f"{len(means)} scenes: a verdict needs at least {LEAST_SCENES}")
-    unseen = f"{len(means)} scenes cannot exclude that a few others are {{}} by up to {reach_of(metric, margin):g} {metric.unit}".rstrip()
-    if entry["verdict"] == "undecided" and verdict(interval.bounds, 1.0, margin, metric.direction) == "non-inferior":
-        notes.append(unseen.format("worse"))
-    if entry["verdict"] == "worse" and verdict(_both(interval.bounds, guarded), 0.0, margin, metric.direction) != "worse":
-        notes.append(unseen.format("better"))
+    elif guarded is None and sampled:
+        notes.append("nothing says how much a scene can differ, so that nothing is decided without a margin")
+    else:
+        entry["verdict"], entry["difference"] = shown
+    others = sorted({UNDONE_BY[one] for one, other in zip(alone, shown, strict=True) if one != other})
+    if others and guarded is not None:
+        many = f"{len(means)} scenes cannot exclude that a few others are {' or '.join(others)}"
+        notes.append(f"{many} by up to {reach_of(metric, margin):g} {metric.unit}".rstrip())
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
-        seen = abs(interval.centre) if metric.direction == "none" else harm([interval.centre] * 2, metric.direction)[0]
-        entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, reach_of(metric, margin) or None)
+        mean = abs(interval.centre) if metric.direction == "none" else harm([interval.centre] * 2, metric.direction)[0]
+        entry["more_scenes"] = more_scenes(mean, entry["spread"], len(means), margin, reach_of(metric, margin) or None)
     return entry
 
 
 def difference_bounds(delta: F64, scenes: I64, metric: MetricInfo, margin: float) -> tuple[Interval, list[float] | None]:
-    """Return the interval of a mean difference, and the guarded bounds that "non-inferior" must hold for; None where there are none.
+    """Return the interval of a mean difference, and the guarded bounds that a verdict must hold for too; None where there are none.
 
     Rates take the interval of `flag_interval`, other quantities with bounds that of `evaluators.statistics.bounded`, all others t. The
     guarded bounds allow for scenes at the worst possible value that were not drawn; without bounds, differences are cut to `reach_of`.

@@ -94,30 +94,26 @@ def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
     return (bounds[0], bounds[1]) if direction == "lower" else (-bounds[1], -bounds[0])
 
 
-def verdict(
-    bounds: list[float] | None, p: float | None, margin: float, direction: Direction, guarded: list[float] | None = None
-) -> Verdict:
+def verdict(bounds: list[float] | None, p: float | None, margin: float, direction: Direction) -> Verdict:
     """Judge a difference by its 95 % interval.
 
-    Non-inferior: the whole interval is better than ``margin`` worse, and so are the guarded bounds. Worse: the whole interval is more than
-    ``margin`` worse, and the test of no difference rejects too (p < 0.05). Undecided: neither. So non-inferior is wrong in at most 2.5 % of
-    runs, also where a few scenes go very wrong and none was drawn (docs/experiments/verdicts.md). A metric without a better side needs a
-    margin, and a change to either side counts as worse.
+    Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is more than ``margin`` worse, and the test
+    of no difference rejects too (p < 0.05). Undecided: neither. A metric without a better side needs a margin, and a change to either side
+    counts as worse. If the bounds hold the guarded ones (`evaluators.statistics.bounded`), each answer is wrong in at most 2.5 % of runs,
+    also where a few scenes differ greatly and none was drawn (docs/experiments/verdicts.md).
 
     Args:
         bounds: [low, high] of renderer minus baseline, or None.
         p: Of the test of no difference; None where there is none.
         margin: How much worse is accepted, in the metric's unit, at least 0.
         direction: The better side of the metric.
-        guarded: [low, high] that hold whatever was not drawn (`evaluators.statistics.bounded`); None: ``bounds`` do.
     """
     if bounds is None or (direction == "none" and margin == 0.0):
         return "undecided"
     low, high = harm(bounds, direction)
-    most = max(high, harm(guarded or bounds, direction)[1])
     if direction == "none":
-        low, most = (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(map(abs, (*bounds, *(guarded or bounds))))
-    if most < margin:
+        low, high = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high)), max(abs(low), abs(high))
+    if high < margin:
         return "non-inferior"
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
 
@@ -220,8 +216,8 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, reach:
         At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be needed.
     """
     needed = scenes_needed(abs(harm - margin), spread)
-    if needed is not None and harm < margin and reach is not None:  # as many again as show that nothing was missed
-        unseen = scenes_without_event(margin - harm, reach - harm)
+    if needed is not None and reach is not None:  # as many again as show that nothing was missed
+        unseen = scenes_without_event(abs(margin - harm), reach - harm if harm < margin else reach + harm)
         needed = None if unseen is None else max(needed, unseen)
     return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
 

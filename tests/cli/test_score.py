@@ -55,16 +55,17 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
 
 def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--preset", "strict,navsim,ncap", "--out", str(out), "--no-report"]
+    presets = "strict,nuplan,navsim,ncap"
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--preset", presets, "--out", str(out), "--no-report"]
     assert run_command([*command, "--quiet"]) == 0
     table = capsys.readouterr().out
-    assert [line.split()[0] for line in table.splitlines() if "pdms" in line or "_score" in line] == ["navsim", "navsim", "ncap"]
+    assert [line.split()[0] for line in table.splitlines() if "pdms" in line or "_score" in line] == ["nuplan", "navsim", "navsim", "ncap"]
     assert "strict" in table
-    assert "PDM-Closed" in table
-    assert {path.name for path in out.iterdir()} == {"strict", "navsim", "ncap"}
+    assert "speed limits" in table
+    assert {path.name for path in out.iterdir()} == {"strict", "nuplan", "navsim", "ncap"}
     assert run_command([*command, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["exit_code"], list(printed["presets"])) == (0, ["strict", "navsim", "ncap"])
+    assert (printed["exit_code"], list(printed["presets"])) == (0, ["strict", "nuplan", "navsim", "ncap"])
     assert printed["presets"]["ncap"]["summary"]["metrics"]["clean"]["ncap_score"]["mean"] == 5.0
     assert run_command([*command[:5], "strict,waymax"]) == 2
 

@@ -84,7 +84,19 @@ def test_navsim_names_what_is_missing_and_keeps_the_middle_of_the_lane():
     assert found["navsim_lk"] == 0.0
     assert values(rollout(track(CRUISE, np.where(np.arange(N) < 15, 0.6, 0.0))), "navsim")["navsim_lk"] == 1.0
     assert "traffic lights" in found["navsim_epdms"]
-    assert found["navsim_pdms"] == "not measured: the progress of PDM-Closed in the same scene"  # it does not read traffic lights
+    assert found["navsim_pdms"] == pytest.approx((5 + 5) / 12)  # it reads no traffic lights; the jump to the side is no comfort
+
+
+@pytest.mark.parametrize(
+    ("driven_m", "recorded_m", "ep"),
+    [(63.2, 63.2, 1.0), (31.6, 63.2, 0.5), (63.2, 47.4, 1.0), (2.0, 4.9, 1.0), (2.0, 5.1, 2.0 / 5.1), (-3.0, 40.0, 0.0)],
+)
+def test_navsims_progress_is_the_share_of_the_greater_of_the_egos_and_the_recordings(driven_m, recorded_m, ep):
+    log = rollout(track(np.linspace(10.0, 10.0 + driven_m, N), 0.0), log=track(np.linspace(10.0, 10.0 + recorded_m, N), 0.0))
+    found = values(log, "navsim")
+    assert found["navsim_ep"] == pytest.approx(ep, abs=1e-6)
+    assert [found[f"navsim_{name}"] for name in ("nc", "dac", "ttc", "hc")] == [1.0] * 4
+    assert found["navsim_pdms"] == pytest.approx((5 * ep + 5 + 2) / 12, abs=1e-6)
 
 
 def plans(log, length_m, n=3):

@@ -126,3 +126,13 @@ def test_metres_get_no_good_answer_by_scenes_that_cannot_have_shown_the_tail(met
     assert wrong <= 3
     alike = 2.0 * usual + rng(1).normal(0.0, 0.05, 200)
     assert state_after(question, {metric: alike}, 200).answer == "good"
+
+
+def test_metres_get_no_bad_answer_where_few_scenes_that_are_far_better_bring_the_mean_to_the_margin():
+    question = Question((metric_question("lateral_distance_m", 0.1, "non-inferior"),))
+    wrong = 0
+    for k in range(30):
+        x = 0.2 + rng(k).normal(0.0, 0.05, 60) - np.where(rng(1000 + k).random(60) < 0.025, 4.0, 0.0)
+        wrong += state_after(question, {"lateral_distance_m": x}, 60).answer == "bad"
+    assert wrong <= 3
+    assert state_after(question, {"lateral_distance_m": 0.5 + rng(1).normal(0.0, 0.05, 200)}, 200).answer == "bad"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from evaluators import METRICS
 from evaluators.statistics.gate import GateSpec, MetricRule, judge, load_gate, shipped_gates
 from evaluators.statistics.verdicts import EXIT_CODES, SEVERITY, Outcome, outcome_of_failures, worst
 
@@ -39,7 +40,7 @@ def rows(shift=0.0, renderer="3dgs", events=0, n_scenes=SCENES, policy="p", blac
 
 
 def gate(**fields):
-    rules = {"route_distance_m": MetricRule(margin=0.1), "img_is_black": MetricRule(max=0.0)}
+    rules = {"route_distance_m": MetricRule(margin=0.1), "offroad": MetricRule(margin=0.05), "img_is_black": MetricRule(max=0.0)}
     return GateSpec(**{"version": 1, "min_scenes": 10, "metrics": rules, **fields})
 
 
@@ -85,28 +86,47 @@ def test_failed_rollouts_are_infrastructure_and_unscored_ones_the_evaluators():
 
 
 def test_a_rule_that_need_not_decide_only_vetoes():
-    rule = {"offroad": MetricRule(margin=0.05, must_decide=False), "route_distance_m": MetricRule(margin=0.1)}
-    spec = gate(metrics=rule)
+    spec = gate(metrics={"offroad": MetricRule(margin=0.05, must_decide=False), "img_is_black": MetricRule(max=0.0)})
     verdict = judge([*rows(renderer="clean"), *rows(events=4)], spec)
-    assert {c.metric: c.cause for c in verdict.checks} == {"offroad": "undecided", "route_distance_m": "pass"}
+    assert {c.metric: c.cause for c in verdict.checks} == {"offroad": "undecided", "img_is_black": "pass"}
     assert verdict.exit_code == 0
     assert cause(rows(events=40), spec) == "regression"
+
+
+def test_a_distance_decides_only_together_with_its_event():
+    rules = {"route_distance_m": MetricRule(margin=0.1), "offroad": MetricRule(margin=0.05, must_decide=False)}
+    both = judge([*rows(renderer="clean"), *rows(events=4)], gate(metrics=rules))
+    assert {c.metric: c.cause for c in both.checks} == {"offroad": "undecided", "route_distance_m": "undecided"}
+    assert "decides only together with its event: offroad is undecided" in both.outcome.reasons[0]
+    alone = judge([*rows(renderer="clean"), *rows()], gate(metrics={"route_distance_m": rules["route_distance_m"]}))
+    assert "the gate has no margin for offroad" in alone.outcome.reasons[0]
+    assert cause(rows(shift=0.5), gate(metrics=rules)) == "regression", "worse is shown by the distance alone"
+
+
+def test_a_suite_that_is_all_that_is_asked_about_needs_no_unseen_scenes():
+    few = {"n_scenes": 20}
+    both = [*rows(renderer="clean", **few), *rows(shift=0.3, **few)]
+    drawn = judge(both, gate())
+    assert drawn.outcome.cause == "undecided"
+    assert "fewer than 146 scenes cannot exclude harm in others" in drawn.outcome.reasons[0]
+    assert judge(both, gate(population="suite")).outcome.cause == "regression"
 
 
 def test_renderers_and_policies_are_judged_one_by_one():
     both = [*rows(renderer="clean"), *rows(renderer="good"), *rows(shift=0.5, renderer="worse one")]
     verdict = judge(both, gate())
-    assert {(c.renderer, c.cause) for c in verdict.checks if c.kind == "margin"} == {("good", "pass"), ("worse one", "regression")}
+    distances = [c for c in verdict.checks if c.metric == "route_distance_m"]
+    assert {(c.renderer, c.cause) for c in distances} == {("good", "pass"), ("worse one", "regression")}
     assert judge(both, gate(renderers=("good",))).exit_code == 0
     other = [*rows(renderer="clean", policy="q"), *rows(shift=0.5, renderer="good", policy="q")]
     arms = judge([*both, *other], gate(renderers=("good",))).checks
-    assert {(c.policy, c.cause) for c in arms if c.kind == "margin"} == {("p", "pass"), ("q", "regression")}
+    assert {(c.policy, c.cause) for c in arms if c.metric == "route_distance_m"} == {("p", "pass"), ("q", "regression")}
 
 
 def test_a_stored_baseline_meets_the_renderer_of_the_same_name():
     stored = [*rows(renderer="clean"), *rows()]
     verdict = judge([*rows(renderer="clean"), *rows(shift=0.5)], gate(), stored, "main.json")
-    assert {(c.renderer, c.cause) for c in verdict.checks if c.kind == "margin"} == {("clean", "pass"), ("3dgs", "regression")}
+    assert {(c.renderer, c.cause) for c in verdict.checks if c.metric == "route_distance_m"} == {("clean", "pass"), ("3dgs", "regression")}
     assert verdict.baseline == "main.json"
 
 
@@ -178,6 +198,7 @@ def test_a_shipped_gate_lets_a_distance_decide_only_together_with_its_events(nam
     run = [row | more for row in driven]
     plain = spec.model_copy(update={"metrics": {key: rule for key, rule in spec.metrics.items() if rule.margin}})
     causes = {check.metric: check.cause for check in judge(run, plain).checks}
-    assert causes.pop("offroad") == "undecided"
-    assert set(causes.values()) == {"pass"}
+    undecided = {metric for metric, cause in causes.items() if cause == "undecided"}
+    assert undecided == {"offroad", *(metric for metric in spec.metrics if METRICS[metric].event == "offroad")} != {"offroad"}
+    assert set(causes.values()) == {"pass", "undecided"}
     assert judge(run, plain).exit_code == 3

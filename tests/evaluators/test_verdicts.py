@@ -57,7 +57,7 @@ def test_difference_knows_no_margin():
 def test_margins_are_given_or_the_documented_defaults():
     base, other = [[float(i)] for i in range(8)], [[i + 0.3 + 0.01 * (i % 3)] for i in range(8)]
     assert pair(base, other)["margin"] == 0.1
-    assert pair(base, other)["verdict"] == "worse"
+    assert pair(base, other, margins={"route_distance_m": 0.2})["margin"] == 0.2
     assert pair([[0.0]] * 3, [[0.0]] * 3, "offroad")["margin"] == 0.02
     many = [[float(i)] for i in range(200)]
     assert pair(many, [[v[0] + 0.3 + 0.01 * (v[0] % 3)] for v in many], margins={"route_distance_m": 0.5})["verdict"] == "non-inferior"
@@ -168,8 +168,22 @@ def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn(
     assert gained(6)["ci95"][0] > 0.05 > gained(6)["guarded"][0]
 
 
-def test_worse_in_metres_says_where_few_other_scenes_could_undo_it():
-    base, other = [[float(i)] for i in range(20)], [[i + 0.3 + 0.01 * (i % 3)] for i in range(20)]
-    found = pair(base, other, "lateral_distance_m")
-    assert (found["verdict"], found["note"]) == ("worse", "20 scenes cannot exclude that a few others are better by up to 4 m")
-    assert "note" not in pair(base, [[i + 2.0 + 0.01 * (i % 3)] for i in range(20)], "lateral_distance_m")
+def test_metres_are_worse_or_better_only_where_few_other_scenes_could_not_undo_it():
+    def moved(by, n=20, **options):
+        base, other = [[50.0 + i] for i in range(n)], [[50.0 + i + by + 0.01 * (i % 3)] for i in range(n)]
+        found = pair(base, other, "lateral_distance_m", **options)
+        return found["verdict"], found["difference"], found.get("note", "")
+
+    few = "20 scenes cannot exclude that a few others are {} by up to 4 m"
+    assert moved(0.3) == ("undecided", "none shown", few.format("better"))
+    assert moved(-0.3) == ("undecided", "none shown", few.format("worse"))
+    assert moved(2.0) == ("worse", "worse", "")
+    assert moved(-2.0) == ("non-inferior", "better", "")
+    assert moved(0.3, 100)[:2] == ("worse", "worse")
+
+
+def test_a_metric_of_which_nothing_says_how_much_a_scene_can_differ_decides_nothing_without_a_margin():
+    base, other = [[float(i)] for i in range(20)], [[i + 5.0 + 0.01 * (i % 3)] for i in range(20)]
+    found = pair(base, other, "contact_x_m")
+    assert (found["verdict"], found["guarded"]) == ("undecided", None)
+    assert "nothing says how much a scene can differ" in found["note"]

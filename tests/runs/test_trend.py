@@ -69,10 +69,10 @@ def test_a_step_has_the_numbers_of_simrun_compare(root: Path, found: Trend) -> N
         other = compare_runs(read_run(step.before.folder), read_run(step.after.folder)).paired["onefixer"]["lateral_distance_m"]
         same = ("diff", "ci95", "p_value", "verdict", "difference", "n_cells", "n_scenes")
         assert {key: step.entry[key] for key in same} == {key: other[key] for key in same}
-    assert [step.entry["difference"] for step in line.steps] == ["better", "worse", "none shown"]
+    assert {step.entry["difference"] for step in line.steps} == {"none shown"}, "of scenes that were not drawn little is known"
     assert [step.moved for step in line.steps] == [True, True, False]
     assert (line.whole.before.folder.name, line.whole.after.folder.name) == ("a", "d")
-    assert line.whole.entry["verdict"] == "worse"
+    assert line.whole.moved
 
 
 def test_each_step_names_what_could_have_moved_it(found: Trend) -> None:

@@ -182,6 +182,23 @@ def harmless_families() -> list[Family]:
     ]
 
 
+def harmful_families() -> list[Family]:
+    """Return families in metres that are worse, turned over: what takes few scenes to be "non-inferior" here is soon called "worse"."""
+    metres = partial(Family, margin=-0.1, reach=4.0, is_rate=False)
+    return [
+        metres("metres, margin 0.1: all 0.3 m worse", turned(seldom_better(0.3, 0.0, 0.0))),
+        metres("metres, margin 0.1: 0.5 m worse, noise of 0.5 m", turned(seldom_better(0.5, 0.0, 0.0, 0.5))),
+        metres("metres, margin 0.1: all 1 m worse", turned(seldom_better(1.0, 0.0, 0.0))),
+        metres("metres, margin 0.1: 20 % of scenes 2 m worse", turned(jumps(0.2, 2.0))),
+        metres("metres, margin 0.1: 0.5 m worse, 2 % by 4 m better", turned(seldom_better(0.5, 0.02, 4.0, 0.1))),
+    ]
+
+
+def turned(draw: Draw) -> Draw:
+    """Return harm as benefit."""
+    return lambda generator, runs, scenes: -draw(generator, runs, scenes)
+
+
 def by_spread(harm: F64, family: Family) -> F64:
     """Return where ``(runs,)`` the interval of what was seen is below the margin: t, or for rates the joined bounds."""
     if not family.is_rate:
@@ -199,7 +216,7 @@ def guarded(harm: F64, family: Family) -> F64:
 def bet(harm: F64, family: Family) -> F64:
     """Return where ``(runs,)`` a bet against "the mean is the margin" wins, as ``simrun decide`` makes it; its error is proved."""
     x = -np.clip(harm.mean(axis=2), -family.reach, family.reach)
-    draws, plan = independent(x, -family.reach, family.reach), Plan(family.margin, x.shape[1], TAIL)
+    draws, plan = independent(x, -family.reach, family.reach), Plan(abs(family.margin), x.shape[1], TAIL)
     sizes = betting.bet_sizes(draws, -family.margin, plan)
     return np.asarray(betting.log_capital(draws, -family.margin, sizes).max(axis=1) >= plan.log_bar)
 
@@ -237,17 +254,17 @@ def worse_by_spread(harm: F64, family: Family) -> F64:
     low = t_bounds(means)[0]
     t = (means.mean(axis=1)) / np.where(alike, 1.0, means.std(axis=1, ddof=1) / np.sqrt(means.shape[1]))
     p = np.where(alike, p, 2.0 * scipy.special.stdtr(means.shape[1] - 1, -np.abs(t)))
-    return np.asarray(np.where(alike, worse_guarded(harm, family), low > family.margin) & (p < ALPHA))
+    return np.asarray(np.where(alike, worse_by(guarded)(harm, family), low > family.margin) & (p < ALPHA))
 
 
-def worse_guarded(harm: F64, family: Family) -> F64:
-    """Return where ``(runs,)`` the guarded bound is above the margin."""
-    return guarded(-harm, replace(family, margin=-family.margin))
+def worse_by(method: Callable[[F64, Family], F64]) -> Callable[[F64, Family], F64]:
+    """Return where ``(runs,)`` a method's bound is above the margin."""
+    return lambda harm, family: method(-harm, replace(family, margin=-family.margin))
 
 
 Methods = dict[str, Callable[[F64, Family], F64]]
 METHODS: Methods = {"spread": by_spread, "betting": bet, "guarded": guarded}
-WORSE: Methods = {"spread": worse_by_spread, "guarded": worse_guarded}
+WORSE: Methods = {"spread": worse_by_spread, "betting": worse_by(bet), "guarded": worse_by(guarded)}
 VALID: Methods = {"guarded": guarded, "betting": bet, "hedged": hedged, "Bernstein": bernstein}
 
 
@@ -348,6 +365,7 @@ def main() -> None:
         "worst": worst_table(SCENES, options.repeats // 5, 8 * options.repeats),
         "power": table(harmless_families(), SCENES_OF_POWER, max(200, options.repeats // 4)),
         "needed": needed_table(harmless_families(), max(200, options.repeats // 4)),
+        "needed-worse": needed_table(harmful_families(), max(200, options.repeats // 4)),
     }
     if options.write is None:
         print("\n".join(f"{name}\n\n{text}" for name, text in made.items()))

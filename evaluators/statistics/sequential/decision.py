@@ -181,7 +181,7 @@ class _Seen:
     sharing: int  # metrics of which one is enough for the bad answer: its evidence is averaged over them
     first_look: int
     whole: F64 | None = None  # the differences of a suite all of whose scenes are driven: its mean is known
-    guard: Draws | None = None  # the differences cut to `reach_of`: the good answer must hold for these by betting too
+    guard: Draws | None = None  # the differences cut to `reach_of`: an answer must hold for these by betting too
 
     def paths(self) -> tuple[F64, F64]:
         """Return the log e-processes ``(n,)`` for the good and for the bad answer."""
@@ -195,10 +195,10 @@ class _Seen:
     def _estimated(self) -> tuple[F64, F64]:
         at, mirror = self.question.threshold, self.draws.mirrored()
         if self.question.direction != "none":
-            return self._guarded(mirror, -at), self._above(self.draws, at, self.sharing)
+            return self._guarded(mirror, -at), self._guarded(self.draws, at, self.sharing)
         # A change to either side counts: the size is within the margin if both ends are, and beyond it if either is.
         below, low_above = self._guarded(mirror, -at), self._guarded(self.draws, -at)
-        above, low_below = self._above(self.draws, at, 2 * self.sharing), self._above(mirror, at, 2 * self.sharing)
+        above, low_below = self._guarded(self.draws, at, 2 * self.sharing), self._guarded(mirror, at, 2 * self.sharing)
         good = np.minimum(np.maximum.accumulate(below), np.maximum.accumulate(low_above))
         return good, np.logaddexp(above, low_below) - np.log(2.0)
 
@@ -208,13 +208,14 @@ class _Seen:
         low, high = self._bound(self.draws, 1.0), self._bound(self.draws.mirrored(), -1.0)
         return low, None if high is None else -high
 
-    def _guarded(self, draws: Draws, mean: float) -> F64:
-        """Return the same for the good answer, which must hold for scenes that were not drawn too."""
-        path = self._above(draws, mean, 1)
+    def _guarded(self, draws: Draws, mean: float, sharing: int = 1) -> F64:
+        """Return what `_above` gives where it holds for scenes that were not drawn too."""
+        path = self._above(draws, mean, sharing)
         if self.guard is None:
             return path
         cut = self.guard if draws is self.draws else self.guard.mirrored()
-        bets = betting.log_capital(cut, mean, betting.bet_sizes(cut, mean, self.plan))
+        plan = replace(self.plan, alpha=self.plan.alpha / sharing)
+        bets = betting.log_capital(cut, mean, betting.bet_sizes(cut, mean, plan))
         return np.minimum(np.maximum.accumulate(path), np.maximum.accumulate(bets))
 
     def _above(self, draws: Draws, mean: float, sharing: int) -> F64:
