@@ -198,6 +198,7 @@ def prepare(simrun: Path, folder: Path, words: list[str]) -> None:
 
 
 def test_other_commands_of_the_pages_are_those_of_a_checkout_or_of_pip_or_the_wizard() -> None:
-    known = ("tests", "docs/scripts", "-m docs.scripts.", "-m alpasim_plugin.", "venv", "pip ", "-m alpasim_wizard ")  # test_bridge.py runs the wizard
+    # test_bridge.py runs the wizard
+    known = ("tests", "docs/scripts", "-m docs.scripts.", "-m alpasim_plugin.", "venv", "pip ", "-m alpasim_wizard ")
     others = {line for page in pages(REPO) for line in lines_of(page) if OTHER.match(line)}
     assert [line for line in sorted(others) if not any(part in line for part in known)] == []
