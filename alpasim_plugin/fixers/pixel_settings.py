@@ -93,6 +93,13 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
         """What a frame costs."""
         return Unit(1, len(self.steps), 0, 0)
 
+    @field_validator("scale", mode="before")
+    @classmethod
+    def _whole(cls, value: Any) -> Any:
+        if value != "auto" and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+            raise ValueError(f"scale = {value!r} | give auto, or a whole number from 1")
+        return value
+
     @field_validator("steps", mode="before")
     @classmethod
     def _counted(cls, value: Any) -> Any:
