@@ -167,6 +167,6 @@ def test_identity_passes_frames_on_and_checks_blocks() -> None:
 
 @pytest.mark.parametrize("scale", ["0", "half", "1.5", "true"])
 def test_a_scale_is_auto_or_a_whole_number(scale: str) -> None:
-    with pytest.raises(InputError, match="scale[\\s\\S]*give auto, or a whole number from 1"):
+    with pytest.raises(InputError, match=r"scale[\s\S]*give auto, or a whole number from 1"):
         fixer_settings("onefixer", [f"scale={scale}"])
     assert fixer_settings("onefixer", ["scale=3"]).scale_of(288, 512) == 3  # type: ignore[attr-defined]
