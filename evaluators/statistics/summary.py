@@ -94,8 +94,11 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
     entry["design_effect"] = design_effect(values, scenes)
     if interval.reason:
         entry["ci95_clustered_reason"] = interval.reason
-    if interval.note:
-        entry["note"] = interval.note
+    notes = [interval.note] if interval.note else []
+    if abs(interval.centre - entry["mean"]) > 1e-9 * max(1.0, abs(entry["mean"])):
+        notes.append(f"scenes have different numbers of values: the interval is about the mean over scenes, {interval.centre:.4g}")
+    if notes:
+        entry["note"] = "; ".join(notes)
     if entry["n_scenes"] > BOOTSTRAP_SCENES:
         why = f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"
     else:

@@ -56,6 +56,8 @@ def test_with_unequal_seeds_scenes_weigh_alike_in_the_clustered_interval():
     found = entry([[1.0, 2.0, 3.0, None], [10.0]], "lateral_bias_m")
     assert found["mean"] == pytest.approx(4.0)  # over rollouts
     assert np.mean(found["ci95_clustered"]) == pytest.approx(6.0)  # over scenes
+    assert found["note"] == "scenes have different numbers of values: the interval is about the mean over scenes, 6"
+    assert "note" not in entry([[1.0, 2.0], [10.0, 3.0]], "lateral_bias_m")
     assert found["n_invalid"] == 1
 
 
