@@ -20,7 +20,7 @@ from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.probe import PolicyQuery, compare, replay
 from alpasim_plugin.runtime.trials import Changed, Findings, Trial, Tried, investigate
-from alpasim_plugin.viewer.cause import Cause, Look, Parting, chosen, commands, failed_at, half_seconds, sentence
+from alpasim_plugin.viewer.cause import Cause, Look, Parting, behind_others, chosen, commands, failed_at, half_seconds, sentence
 from alpasim_plugin.viewer.drive_data import MAX_SAMPLES
 from evaluators.metrics.outcomes import OUTCOMES, in_words
 from evaluators.metrics.plan import first_divergence
@@ -81,13 +81,14 @@ def explain(past: LoggedRollout, run: Run, say: Say) -> Cause:
     )
     driven = _drives(past, findings.promising(MOST_DRIVES), say) if failed_us is not None else []
     partings = [*_by_renderer(past, run, until), *_by_policy(past, run, rollout)]
+    pictures = behind_others(run, rollout)
     return Cause(
         rollout=rollout,
         outcome=in_words(_outcomes(past.manifest)),
         failed_us=failed_us,
         start_us=past.scenario.start_us,
         looks=_looks(queries, own, failed_us),
-        sentences=tuple(_sentences(findings, driven, partings, past.scenario.start_us, failed_us)),
+        sentences=(*pictures, *_sentences(findings, driven, partings, past.scenario.start_us, failed_us, bool(pictures))),
         tried=_tried(findings, driven),
         depends=[(one.what, "yes" if one.is_used else "no", f"{one.apart_m:.2f} m") for one in findings.depends],
         partings=tuple(partings),
@@ -191,16 +192,20 @@ def _by_policy(past: LoggedRollout, run: Run, rollout: Rollout) -> list[Parting]
 
 
 def _sentences(
-    findings: Findings, driven: Sequence[Driven], partings: Sequence[Parting], start_us: int, failed_us: int | None
+    findings: Findings, driven: Sequence[Driven], partings: Sequence[Parting], start_us: int, failed_us: int | None, is_explained: bool
 ) -> list[tuple[str, str]]:
     """Return what was found, the surest first, each with how sure it is: shown, seen or not found.
 
-    Several changes may mend a drive: the one that goes nearest to the recorded path is the likely cause.
+    Several changes may mend a drive: the one that goes nearest to the recorded path is the likely cause, unless the pictures already
+    explain it (``is_explained``): then a change shows only what helps.
     """
-    out = _about_pictures(findings, start_us)
+    out = _about_pictures(findings, start_us, is_explained)
     mend = sorted((one for one in driven if one.mends), key=lambda one: one.aside_m)
-    out += [("shown", f"With {one.trial.name} the drive ends without an event: {one.trial.cause}.") for one in mend[:1]]
-    if mend[1:]:
+    if is_explained and mend:
+        out.append(("seen", f"with {' or '.join(one.trial.name for one in mend)} the drive ends without an event too."))
+    else:
+        out += [("shown", f"With {one.trial.name} the drive ends without an event: {one.trial.cause}.") for one in mend[:1]]
+    if mend[1:] and not is_explained:
         out.append(("seen", f"it ends so with {', '.join(one.trial.name for one in mend[1:])} too, but farther from the recorded path."))
     for one in partings:
         same = one.kind == "renderer" and one.t_us is None
@@ -210,15 +215,17 @@ def _sentences(
             out.append(("seen", f"its plans do not depend on the {used.what.split(',')[0]}."))
     if not findings.repeatable:
         out.append(("seen", "it plans otherwise when asked the same again, so nothing was tried: a policy must repeat itself for a seed."))
-    elif failed_us is not None and not any(how == "shown" for how, _ in out):
+    elif failed_us is not None and not is_explained and not any(how == "shown" for how, _ in out):
         out.append(("not found", "no single change of what it sees or answers mends the drive."))
     out.sort(key=lambda one: one[0] != "shown")
     return [(how, text[0].upper() + text[1:]) for how, text in out]
 
 
-def _about_pictures(findings: Findings, start_us: int) -> list[tuple[str, str]]:
+def _about_pictures(findings: Findings, start_us: int, is_explained: bool) -> list[tuple[str, str]]:
     """Say whether, when and how late plans react to pictures."""
     blind = next((one for one in findings.depends if "picture" in one.what and not one.is_used), None)
+    if blind is not None and is_explained:
+        return [("seen", "whatever is done to these pictures, its plans are the same: it finds nothing in them.")]
     if blind is not None:
         return [("shown", "its plans do not depend on the pictures: whatever is done to them, the plans are the same. It is blind.")]
     late = [one.after_us for one in findings.pulses if one.after_us]

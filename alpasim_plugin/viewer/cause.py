@@ -285,13 +285,27 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
         outcome=in_words(outcomes_of(rollout)),
         failed_us=failed_us,
         start_us=log.render_start_us,
-        sentences=[*(sentence(one, log.render_start_us) for one in partings), *_seen_before(run, rollout, failed_us)],
+        sentences=[
+            *behind_others(run, rollout),
+            *(sentence(one, log.render_start_us) for one in partings),
+            *_seen_before(run, rollout, failed_us),
+        ],
         looks=looks_of(log, rollout.renderer, failed_us),
         tried=[],
         depends=[],
         partings=partings,
         commands=commands(run, rollout, log.render_start_us, failed_us, partings),
     )
+
+
+def behind_others(run: Run, rollout: Rollout) -> list[tuple[str, str]]:
+    """Say behind which renderers of the run the same drive ends without an event: what they show differently is then what made it fail."""
+    same = [r for r in run.rollouts if (r.policy, r.scene, r.seed) == (rollout.policy, rollout.scene, rollout.seed)]
+    better = [r.renderer for r in same if r.ok and not outcomes_of(r)]
+    if not better or not outcomes_of(rollout):
+        return []
+    told = f"Behind {' and '.join(better)} the same drive ends without an event"
+    return [("shown", f"{told}: the pictures of {rollout.renderer} make the difference.")]
 
 
 def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[tuple[str, str]]:

@@ -1,11 +1,12 @@
 """Make docs/img/drive.gif of a run: one scene behind three renderers, with the plan in force drawn into each picture.
 
-simrun --renderer clean,3dgs,onefixer --policy lane-camera --set timing.duration_us=6000000 --out RUN hard/sharp_s_curve
-python docs/scripts/first_picture.py RUN hard-sharp_s_curve
+simrun --renderer clean,3dgs,onefixer --policy lane-camera --out RUN suites/first
+python docs/scripts/first_picture.py RUN hard-hard_brake
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -16,14 +17,16 @@ from PIL import Image
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.log import decode_image, read_asl
+from evaluators.metrics.outcomes import event_words, first_failure
 
 COLOURS = {"clean": (11, 107, 179), "3dgs": (194, 84, 10), "onefixer": (0, 128, 106)}
-SIZE, GAP_PX, FRAMES, MS, PALETTE = (320, 180), 6, slice(5, 60, 2), 200, 96
+SIZE, GAP_PX, FRAMES, MS, PALETTE = (320, 180), 6, slice(1, 57, 2), 200, 96
 
 
-def frames(log_path: Path, name: str) -> list[U8]:
-    """Return the frames of a rollout ``(H, W, 3)``, with its plans and its name."""
-    log, colour, out = read_asl(log_path), COLOURS[name], []
+def frames(folder: Path, name: str) -> list[U8]:
+    """Return the frames of a rollout ``(H, W, 3)``, with its plans, its name and, from then on, its first failure."""
+    log, colour, out = read_asl(folder / "rollout.asl"), COLOURS[name], []
+    failure = first_failure(json.loads((folder / "manifest.json").read_text()))
     camera = log.info["cameras"][0]
     scale = SIZE[0] / camera.width
     for image in log.images[FRAMES]:
@@ -39,13 +42,16 @@ def frames(log_path: Path, name: str) -> list[U8]:
             cv2.polylines(rgb, [line], False, ink, width, cv2.LINE_AA, 3)
         cv2.rectangle(rgb, (0, 0), (12 + 9 * len(name), 22), (255, 255, 255), -1)
         cv2.putText(rgb, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.48, colour, 1, cv2.LINE_AA)
+        if failure is not None and image.end_us >= failure["t_us"]:
+            cv2.rectangle(rgb, (0, SIZE[1] - 24), SIZE, (255, 255, 255), -1)
+            cv2.putText(rgb, event_words(failure["metric"]), (6, SIZE[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.48, colour, 1, cv2.LINE_AA)
         out.append(rgb)
     return out
 
 
 def main(run: Path, scene: str) -> None:
     """Write the picture."""
-    panels = [frames(run / "rollouts" / name / "lane-camera" / scene / "0" / "rollout.asl", name) for name in COLOURS]
+    panels = [frames(run / "rollouts" / name / "lane-camera" / scene / "0", name) for name in COLOURS]
     gap = np.full((SIZE[1], GAP_PX, 3), 255, np.uint8)
     rows = [np.concatenate([one, gap, two, gap, three], axis=1) for one, two, three in zip(*panels, strict=False)]
     pictures = [Image.fromarray(row).convert("P", palette=Image.Palette.ADAPTIVE, colors=PALETTE) for row in rows]

@@ -70,6 +70,14 @@ class Right(ByRoute):
         return replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
 
 
+class ByContrast(Right):
+    """Follows the route where a picture shows anything, and loses its way where it is grey."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        return plan if np.ptp(observation.frames["front"].rgb) > 9 else replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Give a run of the three in a bend."""
@@ -103,6 +111,21 @@ def test_a_seeded_fault_is_named(run: Path, policy: str, words: str, capsys: pyt
     assert 'data-key="f"' in page
     assert 'data-key="w"' not in page  # what was tried is not offered again
     assert page.count('class="card scroll"') == page.count('class="card scroll" tabindex="0" role="region"')
+
+
+def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bend.yaml").write_text(BEND)
+    plan = make_plan(expand(str(tmp_path / "bend.yaml")), (GREY, "clean"), (f"{HERE}:ByContrast",), (0,), RunOptions())
+    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none")
+    failed = next((tmp_path / "run").glob("rollouts/*/*/*/*/why.html")).parent
+    words = f"Behind clean the same drive ends without an event: the pictures of {GREY} make the difference."
+    assert words in (failed / "why.html").read_text()
+    assert run_command(["why", str(failed), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["found"]
+    assert found[0] == {"how": "shown", "text": words}
+    assert {one["how"] for one in found[1:]} <= {"seen"}, found
 
 
 def test_the_run_writes_a_page_for_what_failed_and_links_it(run: Path) -> None:
