@@ -330,8 +330,8 @@ def _shot(run: Run, rollout: Rollout) -> Shot | None:
         return None
     first = first_failure(manifest)
     k = min(USUAL_FRAME, len(times) - 1)
-    if first is not None:
-        k = min(range(len(times)), key=lambda i: abs(times[i] - int(first["t_us"])))
+    if first is not None:  # what led to it: after a contact the camera may be inside the other vehicle
+        k = max((i for i, t_us in enumerate(times) if t_us <= int(first["t_us"])), default=0)
     try:
         strip = decode_image(read_bytes(path, DOING_SHOT, SOURCE_BYTES), path, DOING_SHOT)
     except InputError:

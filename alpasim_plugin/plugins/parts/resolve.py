@@ -328,5 +328,5 @@ def _require_fixer(name: str, front: str, is_composite: bool) -> None:
         f"renderer {name!r}",
         f"no {'fixer' if is_composite else 'renderer or fixer'} has the name {plain!r}",
         (f"did you mean {near[0]!r}? " if near else "")
-        + f"renderers: {', '.join(renderers)}; fixers: {', '.join(fixers)}; together FIXER+RENDERER; your own as package.module:Class",
+        + "'simrun list renderers' and 'simrun list fixers' name them; together FIXER+RENDERER; your own as package.module:Class",
     )
