@@ -1,6 +1,6 @@
 """The error budget of a headline: what each step and each sample adds to the difference that README states, as shares of its interval.
 
-    python docs/scripts/error_budget.py drive DRIVES.json [SCENE...]     # 20 shipped scenes by default; what the file has is kept
+    python docs/scripts/error_budget.py drive DRIVES.json [SCENE[#DRAW]...]    # 20 shipped scenes by default; what the file has is kept
     python docs/scripts/error_budget.py rescore RECORD SCORES.json       # one seed's logs, scored again at half the step
     python docs/scripts/error_budget.py table RECORD DRIVES.json SCORES.json      # writes docs/experiments/error-budget.md
 
@@ -105,10 +105,9 @@ def judged(log: RolloutLog, scene: Scene) -> dict[str, float | None]:
     return {name: values[name].value if values[name].valid else None for name in (EVENT, DISTANCE)}
 
 
-def one_drive(path: Path, what: str, renderer: str, share: float) -> dict[str, Any]:
-    """Drive a scene, and give its numbers and its processor milliseconds per frame."""
-    ref, us = expand(str(path))[0], duration_us(path, SECONDS)
-    scenario = load_scenario(path, ref.seed, overrides(what, us))
+def one_drive(path: Path, draw: int, what: str, renderer: str, share: float) -> dict[str, Any]:
+    """Drive a scene as jitter draws it, and give its numbers and its processor milliseconds per frame."""
+    scenario = load_scenario(path, draw, overrides(what, duration_us(path, SECONDS)))
     setting = ("precision=bf16",) if what == "fixer precision" else ("precision=fp32",)
     with halved(what, share):
         made = make_renderer(renderer, scenario, threads=1, overrides=setting if renderer == FIXED else ())
@@ -119,9 +118,9 @@ def one_drive(path: Path, what: str, renderer: str, share: float) -> dict[str, A
     return {**judged(log, scenario.scene), "ms": 1e3 * spent / max(1, len(log.images)), "frames": len(log.images)}
 
 
-def raster_share(path: Path) -> tuple[float, int]:
+def raster_share(path: Path, draw: int) -> tuple[float, int]:
     """Return the share of a first frame's 8-bit values that float64 rounds otherwise, at least `LEAST_SHARE`, and the most levels."""
-    scenario = load_scenario(path, 0, [*overrides("", duration_us(path, SECONDS)), camera(128, 72)])
+    scenario = load_scenario(path, draw, [*overrides("", duration_us(path, SECONDS)), camera(128, 72)])
     seen: list[tuple[Any, Any]] = []
 
     class Seen(Exception):
@@ -145,25 +144,26 @@ def raster_share(path: Path) -> tuple[float, int]:
     return max(float((apart > 0).mean()), LEAST_SHARE), int(apart.max())
 
 
-def scenes() -> list[Path]:
+def scenes() -> list[str]:
     """Return the shipped scenes that are driven."""
-    return [Path(ref.path) for suite in SUITES for ref in expand(f"suites/{suite}")][:MOST]
+    return [ref.path for suite in SUITES for ref in expand(f"suites/{suite}")][:MOST]
 
 
-def drive(out: Path, paths: Sequence[Path]) -> None:
-    """Add drives to a file, all steps of a scene before the next scene."""
+def drive(out: Path, asked: Sequence[str]) -> None:
+    """Add drives to a file, all steps of a scene before the next scene; ``SCENE#2`` is its second draw."""
     known = json.loads(out.read_text()) if out.exists() else {"drives": {}, "raster": {}}
-    for path in paths:
-        name = f"{path.parent.name}/{path.stem}"
+    for file, _, drawn in (one.partition("#") for one in asked):
+        path, draw = Path(expand(file)[0].path), int(drawn or 0)
+        name = f"{path.parent.name}/{path.stem}" + (f"#{draw}" if draw else "")
         if name not in known["raster"]:
-            known["raster"][name] = raster_share(path)
+            known["raster"][name] = raster_share(path, draw)
             write_json(out, known)
         for what in ("", *STEPS):
             for renderer in (BASELINE, FIXED):
                 key = f"{name}|{what}|{renderer}"
                 if key in known["drives"] or (what == "fixer precision" and renderer == BASELINE):
                     continue
-                known["drives"][key] = one_drive(path, what, renderer, known["raster"][name][0])
+                known["drives"][key] = one_drive(path, draw, what, renderer, known["raster"][name][0])
                 print(key, known["drives"][key], flush=True)
                 write_json(out, known)
 
@@ -267,10 +267,17 @@ def changed(usual: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any
     both = [name for name in two if name in one]
     cells = [key for key in other if key in usual]
     flips = sum(usual[key][EVENT] != other[key][EVENT] for key in cells)
-    moved = {metric: np.array([two[name][metric] - one[name][metric] for name in both]) for metric in (EVENT, DISTANCE)}
+    _, scene = np.unique([name.partition("#")[0] for name in both], return_inverse=True)
+    moved = {metric: scene_means([two[name][metric] - one[name][metric] for name in both], scene) for metric in (EVENT, DISTANCE)}
     timed = [name for name in both if "ms" in other[f"{name}|{FIXED}"]]
-    ratio = np.array([np.log(other[f"{name}|{FIXED}"]["ms"] / usual[f"{name}|{FIXED}"]["ms"]) for name in timed])
-    return {"scenes": len(both), "moved": moved, "flips": flips, "cells": len(cells), "log_ratio": ratio}
+    _, scene = np.unique([name.partition("#")[0] for name in timed], return_inverse=True)
+    ratio = scene_means([np.log(other[f"{name}|{FIXED}"]["ms"] / usual[f"{name}|{FIXED}"]["ms"]) for name in timed], scene)
+    return {"scenes": len(moved[DISTANCE]), "moved": moved, "flips": flips, "cells": len(cells), "log_ratio": ratio}
+
+
+def scene_means(values: Sequence[float], scene: np.ndarray) -> np.ndarray:
+    """Return the mean of every scene over its draws."""
+    return cluster_means(np.array(values), scene)[0] if len(values) else np.zeros(0)
 
 
 def verdict(mean: float, half: float, most: float) -> str:
@@ -333,14 +340,14 @@ def main() -> None:
     """Drive, score again, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("drive", "rescore", "table"))
-    parser.add_argument("files", type=Path, nargs="+", help="As above.")
+    parser.add_argument("files", nargs="+", help="As above.")
     given = parser.parse_args()
     if given.what == "drive":
-        drive(given.files[0], given.files[1:] or scenes())
+        drive(Path(given.files[0]), given.files[1:] or scenes())
     elif given.what == "rescore":
-        rescore(*given.files)
+        rescore(*map(Path, given.files))
     else:
-        record, *kept = given.files
+        record, *kept = map(Path, given.files)
         page = DOCS / "experiments" / "error-budget.md"
         text = table(record, *(json.loads(path.read_text()) for path in kept))
         page.write_text(put(page.read_text(encoding="utf-8"), "error-budget", text), encoding="utf-8")
