@@ -311,8 +311,8 @@ def table(record: Path, known: Mapping[str, Any], rescored: Mapping[str, Any]) -
             continue
         change, half = mean_with_bounds(row["moved"][DISTANCE])
         share = abs(change) / width[DISTANCE]
-        most = 1.0 - 0.025 ** (1.0 / row["cells"]) if not row["flips"] else None
-        flips = f"{row['flips']} of {row['cells']}" + ("" if most is None else f" (below {100 * most:.1f} %)")
+        most = float(scipy.special.betaincinv(row["flips"] + 1, row["cells"] - row["flips"], 0.975))
+        flips = f"{row['flips']} of {row['cells']} (below {100 * most:.1f} %)"
         spent = "" if len(row["log_ratio"]) < 2 else "{:.2f} ± {:.2f}".format(*ratio_of(row["log_ratio"]))
         said = verdict(change, half, TENTH * width[DISTANCE])
         cells = f"{change:+.4f} ± {half:.4f} | {100 * share:.1f} % | {said} | {flips} | {spent}"
