@@ -311,7 +311,8 @@ def table(record: Path, known: Mapping[str, Any], rescored: Mapping[str, Any]) -
             continue
         change, half = mean_with_bounds(row["moved"][DISTANCE])
         share = abs(change) / width[DISTANCE]
-        most = float(scipy.special.betaincinv(row["flips"] + 1, row["cells"] - row["flips"], 0.975))
+        kept = row["cells"] - row["flips"]
+        most = float(scipy.special.betaincinv(row["flips"] + 1, kept, 0.975)) if kept else 1.0
         flips = f"{row['flips']} of {row['cells']} (below {100 * most:.1f} %)"
         spent = "" if len(row["log_ratio"]) < 2 else "{:.2f} ± {:.2f}".format(*ratio_of(row["log_ratio"]))
         said = verdict(change, half, TENTH * width[DISTANCE])

@@ -56,7 +56,7 @@ def test_a_step_is_judged_by_its_paired_change_against_a_tenth_of_the_interval(b
     rescored = {key.replace("||", "|"): [row, row] for key, row in drives(budget, "", 0.0).items()}
     lines = budget.table(tmp_path, json.loads(json.dumps(known)), rescored).splitlines()
     of = {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.startswith("| ")}
-    assert "| missed | 12 of 12 | 2.00 ± 0.00 |" in of["resolution"]
+    assert "| missed | 12 of 12 (below 100.0 %) | 2.00 ± 0.00 |" in of["resolution"]
     assert "| met | 0 of 12 (below 26.5 %) | 1.00 ± 0.00 |" in of["vehicle step"]
     assert "| met | 0 of 12 " in of["fixer precision"]
     assert "| 6 | +0.0000 ± 0.0000 | 0.0 % | met |" in of[budget.EVALUATOR]
@@ -75,3 +75,15 @@ def test_the_scenes_and_steps_are_those_of_the_page(budget: ModuleType, repo: Pa
     assert len(budget.scenes()) == 20
     for what in (*budget.STEPS, budget.EVALUATOR):
         assert f"*{what[0].upper()}{what[1:]}*" in page
+
+
+def test_draws_of_a_scene_count_as_one_scene(budget: ModuleType) -> None:
+    usual = {
+        f"{name}|{arm}": {budget.EVENT: 0.0, budget.DISTANCE: 1.0}
+        for name in ("s/0", "s/0#1", "s/1")
+        for arm in (budget.FIXED, budget.BASELINE)
+    }
+    other = {key: {**row, budget.DISTANCE: 1.0 + 0.4 * key.startswith("s/0#1|" + budget.FIXED)} for key, row in usual.items()}
+    found = budget.changed(usual, other)
+    assert found["scenes"] == 2
+    assert found["moved"][budget.DISTANCE] == pytest.approx([0.2, 0.0])
