@@ -29,6 +29,7 @@ from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, li
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
 from alpasim_plugin.nets.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
+from alpasim_plugin.nets.pixel_layers import pack
 from alpasim_plugin.nets.reference_blend import BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
 
 DOING = "loading the network of a fixer"
@@ -68,6 +69,8 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     else:
         net, trained, note = _untrained(settings), False, f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
+    if device == "cpu" and torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
+        pack(net)
     if device == "cpu" and net.blend is not None:
         net.blend.likeness, net.blend.offsets = likeness_cpu, offsets_cpu
     step = RecordedStep(net) if device == "cpu" else GeneratorStep(net)

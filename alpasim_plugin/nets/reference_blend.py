@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.nets.pixel_layers import Conv3, Upsample, activation, cells, pixels
+from alpasim_plugin.nets.pixel_layers import Conv3, Dense, Upsample, activation, cells, pixels
 
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
 CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
@@ -62,18 +62,18 @@ class ReferenceBlend(nn.Module):
 
     def __init__(self, coarse: int, detail: int, width: int) -> None:
         super().__init__()
-        self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
-        self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
-        self.coarse = nn.Linear(CELL**2 * CHANNELS, coarse)
-        self.sought = nn.Linear(coarse, MATCH_CHANNELS, bias=False)
+        self.stem = Dense(CELL**2 * CHANNELS, coarse, bias=False)
+        self.read = Dense(DETAIL**2 * CHANNELS, detail, bias=False)
+        self.coarse = Dense(CELL**2 * CHANNELS, coarse)
+        self.sought = Dense(coarse, MATCH_CHANNELS, bias=False)
         self.shown = Conv3(coarse, MATCH_CHANNELS)
-        self.match = nn.Linear((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
+        self.match = Dense((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
         self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
-        self.shift = nn.Linear(width, 2)
+        self.shift = Dense(width, 2)
         self.up = Upsample(width, detail)
-        self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
+        self.own = Dense(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
-        self.write = nn.Linear(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        self.write = Dense(width, DETAIL**2 + 2 + DETAIL**2 * 3)
         # Where no gradient is asked for, faster ones may stand here.
         self.likeness: Callable[[Tensor, Tensor], Tensor] = likeness
         self.offsets: Callable[[Tensor, Tensor], Tensor] = offsets
@@ -103,9 +103,9 @@ class ReferenceBlend(nn.Module):
         side = activation(_added(self.coarse(beside.each4.to(y.dtype)), y), inplace=True)
         alike = self.likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
-        at4 = activation(self.align[1](at4), inplace=True)
+        at4 = self.align[1](at4, activated=True)
         joined = _added(self.own(beside.each2.to(fine.dtype)).add_(self.up(at4)), fine)
-        said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
+        said = self.write(self.head(activation(joined, inplace=True), activated=True)).float()
         weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
         return BlendHeads(weight, self.offsets(offset.flatten(0, 1), self.shift(at4).float()).view(offset.shape), correction)
 
