@@ -1,8 +1,6 @@
-"""What a generator in pixels reads and writes, and how it compares references with a picture, for processors: one pass over the images
-instead of one for each operation.
+"""What a generator in pixels reads and writes, and how it compares references, for processors: one pass instead of one for each operation.
 
-`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `gather_beside_cpu`, `likeness_cpu`, `offsets_cpu` and `mix_cpu` are those of
-`nets.reference_blend`.
+`gather_cells_cpu` is that of `nets.pixel_generator`, the others are those of `nets.reference_blend`.
 """
 
 # Numba's decorators are untyped.
@@ -23,16 +21,15 @@ LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow,
 
 
 def gather_cells_cpu(
-    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, dtype: torch.dtype = torch.float32
+    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, dtype: torch.dtype
 ) -> GatheredCells:
     """Return the same as `nets.pixel_generator.gather_cells`, of float32 tensors on the CPU, bit for bit, rounded to ``dtype``."""
     b, h, w, _ = render.shape
-    noise = 0 if source is render else 1
     images = render, opacity, sdmap, state.output, state.render, source, state.hidden
     rows = [np.ascontiguousarray(x.numpy()).reshape(*x.shape[:2], -1) for x in images]
     coarse = torch.empty(b, h // CELL, w // CELL, CELL * CELL * IMAGES + state.hidden.shape[-1], dtype=dtype)
     fine = torch.empty(b, h // DETAIL, w // DETAIL, DETAIL * DETAIL * DETAIL_IMAGES, dtype=dtype)
-    _gather_coarse(*rows, noise, _array(coarse))
+    _gather_coarse(*rows, source is not render, _array(coarse))
     _gather_fine(rows[0], rows[1], rows[3], _array(fine))
     return GatheredCells(coarse, fine)
 
@@ -125,14 +122,10 @@ def gather_beside_cpu(references: Tensor, render: Tensor, scale: int = 1, dtype:
 
 @njit(cache=True, nogil=True)
 def _gather_beside(references, render, scale, mean4, mean2, each4, each2):
-    batch, height, width, _ = render.shape
-    count = references.shape[1]
+    batch, count, height, width = references.shape[0], references.shape[1], render.shape[1], render.shape[2]
     share, level = np.float32(1.0) / np.float32(count), np.float32(1.0) / np.float32(HALF * scale * scale)
-    row, mean, said = (
-        np.empty(CHANNELS * width, np.float32),
-        np.empty(CHANNELS * width, np.float32),
-        np.empty(CHANNELS * width, mean4.dtype),
-    )
+    size = CHANNELS * width
+    row, mean, said = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, mean4.dtype)
     for b in range(batch):
         for y in range(height):
             i4, i2, at4, at2 = y // CELL, y // DETAIL, (y % CELL) * CELL * CHANNELS, (y % DETAIL) * DETAIL * CHANNELS
@@ -146,9 +139,9 @@ def _gather_beside(references, render, scale, mean4, mean2, each4, each2):
                             row[i] = np.float32(line[i])
                     else:
                         for x in range(width):
-                            for i in range(scale):
+                            for i in range(scale * x, scale * (x + 1)):
                                 for c in range(CHANNELS):
-                                    row[CHANNELS * x + c] += np.float32(line[CHANNELS * (scale * x + i) + c])
+                                    row[CHANNELS * x + c] += np.float32(line[CHANNELS * i + c])
                 for x in range(width):
                     holds = row[CHANNELS * x + 3] * level * np.float32(0.5)
                     for c in range(3):
@@ -271,30 +264,37 @@ def _mix(repaired, references, weight, offset_px, correction, scale, out, record
     batch, count, height, width = references.shape
     one, zero, largest, nowhere = np.float32(1.0), np.float32(0.0), np.float32(LARGEST), np.float32(NOWHERE)
     level, half = np.float32(1.0 / HALF), np.float32(0.5 / HALF)
-    right, below = np.float32(width - 1), np.float32(height - 1)
     y0, y1, fy = _between(height, scale)
     x0, x1, fx = _between(width, scale)
     v0, v1, fv = _between(height, scale * DETAIL)
     u0, u1, fu = _between(width, scale * DETAIL)
-    rows, moved = np.empty((2, width // (scale * DETAIL)), np.float32), np.empty((2, width), np.float32)
-    near, far = np.empty((CHANNELS, width // scale), np.float32), np.empty((CHANNELS, width // scale), np.float32)
+    rows, near = np.empty((2, width // (scale * DETAIL)), np.float32), np.empty((CHANNELS, width // scale), np.float32)
+    # What is said of the two coarser rows around a row of pixels, by whether their number is odd; the next row most often has the same.
+    moves, words = np.empty((count, 2, 2, width), np.float32), np.empty((count, 2, CHANNELS, width), np.float32)
+    row_of = np.empty((count, 4), np.int64)
     place, corners, shares = np.empty((4, width), np.uint32), np.empty((4, width), np.uint32), np.empty((4, width), np.float32)
-    said, found = np.empty((CHANNELS, width), np.float32), np.empty((CHANNELS, width), np.float32)
-    total, share, blended = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((3, width), np.float32)
+    found, blended = np.empty((CHANNELS, width), np.float32), np.empty((3, width), np.float32)
+    total, share = np.empty(width, np.float32), np.empty(width, np.float32)
     for b in range(batch):
+        row_of[:] = -1
         for y in range(height):
             total[:] = one
             for x in range(width):
                 for c in range(3):
                     blended[c, x] = repaired[b, y, x, c]
             for k in range(count):
-                upper, lower = offset_px[b, k, v0[y]], offset_px[b, k, v1[y]]
-                for j in range(rows.shape[1]):
-                    for c in range(2):
-                        rows[c, j] = np.float32(scale) * (upper[j, c] + fv[y] * (lower[j, c] - upper[j, c]))
-                _stretched(rows, u0, u1, fu, moved)
+                for row in (v0[y], v1[y]):
+                    if row_of[k, row % 2] != row:
+                        row_of[k, row % 2] = row
+                        for j in range(rows.shape[1]):
+                            for c in range(2):
+                                rows[c, j] = np.float32(scale) * offset_px[b, k, row, j, c]
+                        _stretched(rows, u0, u1, fu, moves[k, row % 2])
+                upper, lower = moves[k, v0[y] % 2], moves[k, v1[y] % 2]
                 for x in range(width):
-                    px, py = min(max(np.float32(x) + moved[0, x], zero), right), min(max(np.float32(y) + moved[1, x], zero), below)
+                    px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
+                    py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
+                    px, py = min(max(px, zero), np.float32(width - 1)), min(max(py, zero), np.float32(height - 1))
                     left, top = np.int32(px), np.int32(py)
                     a, g = px - np.float32(left), py - np.float32(top)
                     shares[3, x] = g * a
@@ -314,24 +314,25 @@ def _mix(repaired, references, weight, offset_px, correction, scale, out, record
                         for corner in range(4):
                             value += shares[corner, x] * np.float32(np.int32((corners[corner, x] >> shift) & np.uint32(255)))
                         found[c, x] = value
-                _said(weight[b, k], correction[b, k], y0[y], near)
-                if scale == 1:
-                    said = near
-                else:
-                    _said(weight[b, k], correction[b, k], y1[y], far)
-                    for c in range(CHANNELS):
-                        for j in range(near.shape[1]):
-                            near[c, j] += fy[y] * (far[c, j] - near[c, j])
-                    _stretched(near, x0, x1, fx, said)
+                for row in (y0[y], y1[y]):
+                    if row_of[k, 2 + row % 2] != row:
+                        row_of[k, 2 + row % 2] = row
+                        if scale == 1:
+                            _said(weight[b, k], correction[b, k], row, words[k, row % 2])
+                        else:
+                            _said(weight[b, k], correction[b, k], row, near)
+                            _stretched(near, x0, x1, fx, words[k, row % 2])
+                upper, lower = words[k, y0[y] % 2], words[k, y1[y] % 2]
                 for x in range(width):
-                    share[x] = min(said[3, x], largest)
+                    share[x] = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
                 _exponentials(share)
                 for x in range(width):
                     share[x] *= min(max(found[3, x] * half, nowhere), one)
                     total[x] += share[x]
                 for c in range(3):
                     for x in range(width):
-                        blended[c, x] += share[x] * (found[c, x] * level - one + said[c, x])
+                        said = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
+                        blended[c, x] += share[x] * (found[c, x] * level - one + said)
             for x in range(width):
                 over = one / total[x]
                 for c in range(3):

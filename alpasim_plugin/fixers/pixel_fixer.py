@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -193,7 +194,8 @@ class PixelFixer(Fixer):
 
         joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True))) if len(states) > 1 else states[0]
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
-        images = after.output[:, :height, :width].add(1).mul_(HALF).round_().to(torch.uint8).cpu().numpy()
+        shown = after.output[:, :height, :width].cpu().numpy()
+        images = np.stack([cv2.convertScaleAbs(one, alpha=HALF, beta=HALF) for one in shown])
         found = []
         for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
             before = None if past is None else (past.fixed, past.raw)

@@ -255,8 +255,9 @@ def draw_and_gather() -> None:
     """Draw a line and a car, carry a picture into another view and gather its cells: tiny cases of all kernels of what a fixer reads."""
     from alpasim_plugin.core.geometry import se2
     from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
+    from alpasim_plugin.fixers.ground import carry
     from alpasim_plugin.fixers.trust import trust
-    from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
+    from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes
     from alpasim_plugin.semantic_map.draw import draw_map
     from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
 
@@ -270,7 +271,7 @@ def draw_and_gather() -> None:
 
     depth = np.ones((side_px, side_px), np.float32)
     picture = Picture(K, ahead, np.zeros((side_px, side_px, 3), np.uint8), depth, {"car": T_world_car})
-    warp(picture, WarpTarget(K, ahead, depth, {"car": T_world_car}, {"car": box}))
+    carry([picture], WarpTarget(K, ahead, depth, {"car": T_world_car}, {"car": box}), np.eye(4))
     for focal_px in (8.0, 80.0):  # the car fills a part of the picture's rows, and all of them
         zoomed = np.array([[focal_px, 0, 8], [0, focal_px, 8], [0, 0, 1]])
         on_boxes(depth.shape, place_boxes(depth.shape, zoomed, ahead, {"car": T_world_car}, {"car": box}).seen)

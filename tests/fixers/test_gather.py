@@ -39,10 +39,11 @@ def recordings(batch: int, references: int, height: int, width: int) -> Tensor:
 def test_one_pass_gathers_the_same_bits(batch: int, height: int, width: int, hidden: int, noisy: bool) -> None:
     render, opacity, sdmap, state = images(batch, height, width, hidden)
     source = render * 0.25 if noisy else render
-    fast, plain = (gather(render, opacity, sdmap, state, source) for gather in (gather_cells_cpu, gather_cells))
+    given = render, opacity, sdmap, state, source
+    fast, plain = gather_cells_cpu(*given, torch.float32), gather_cells(*given)
     assert torch.equal(fast.coarse, plain.coarse)
     assert torch.equal(fast.fine, plain.fine)
-    half = gather_cells_cpu(render, opacity, sdmap, state, source, torch.bfloat16)
+    half = gather_cells_cpu(*given, torch.bfloat16)
     assert torch.equal(half.coarse, plain.coarse.bfloat16())
     assert torch.equal(half.fine, plain.fine.bfloat16())
 
@@ -67,7 +68,7 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
         sdmap[half],
         state._replace(output=state.output[half], render=state.render[half], hidden=state.hidden[:, :4, :8]),
     )
-    fast, plain = (gather(*views, views[2]) for gather in (gather_cells_cpu, gather_cells))
+    fast, plain = gather_cells_cpu(*views, views[2], torch.float32), gather_cells(*views, views[2])
     assert torch.equal(fast.coarse.nan_to_num(7.0), plain.coarse.nan_to_num(7.0))
     assert torch.equal(fast.fine.nan_to_num(7.0), plain.fine.nan_to_num(7.0))
 
