@@ -1,8 +1,6 @@
-"""What a generator in pixels reads and writes, and how it compares references with a picture, for processors: one pass over the images
-instead of one for each operation.
+"""What a generator in pixels reads and writes, and how it compares references, for processors: one pass instead of one for each operation.
 
-`gather_cells_cpu` is `nets.pixel_generator.gather_cells`; `gather_beside_cpu`, `likeness_cpu`, `offsets_cpu` and `mix_cpu` are those of
-`nets.reference_blend`.
+`gather_cells_cpu` is that of `nets.pixel_generator`, the others are those of `nets.reference_blend`.
 """
 
 # Numba's decorators are untyped.
@@ -14,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.fixers.views import HALF
 from alpasim_plugin.nets.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
 from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, MATCH_CELLS, NOWHERE, OFFSET_PX, BesideCells, BlendHeads
 from alpasim_plugin.plugins.kernels import njit
@@ -21,94 +20,141 @@ from alpasim_plugin.plugins.kernels import njit
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 
 
-def gather_cells_cpu(render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor) -> GatheredCells:
-    """Return the same as `nets.pixel_generator.gather_cells`, of float32 tensors on the CPU, bit for bit."""
+def gather_cells_cpu(
+    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor, dtype: torch.dtype
+) -> GatheredCells:
+    """Return the same as `nets.pixel_generator.gather_cells`, of float32 tensors on the CPU, bit for bit, rounded to ``dtype``."""
     b, h, w, _ = render.shape
-    noise = 0 if source is render else 1
-    images = [np.ascontiguousarray(x.numpy()) for x in (render, opacity, sdmap, state.output, state.render, source, state.hidden)]
-    coarse = torch.empty(b, h // CELL, w // CELL, CELL * CELL * IMAGES + state.hidden.shape[-1])
-    fine = torch.empty(b, h // DETAIL, w // DETAIL, DETAIL * DETAIL * DETAIL_IMAGES)
-    _gather_coarse(*images, noise, coarse.numpy())
-    _gather_fine(images[0], images[1], images[3], fine.numpy())
+    images = render, opacity, sdmap, state.output, state.render, source, state.hidden
+    rows = [np.ascontiguousarray(x.numpy()).reshape(*x.shape[:2], -1) for x in images]
+    coarse = torch.empty(b, h // CELL, w // CELL, CELL * CELL * IMAGES + state.hidden.shape[-1], dtype=dtype)
+    fine = torch.empty(b, h // DETAIL, w // DETAIL, DETAIL * DETAIL * DETAIL_IMAGES, dtype=dtype)
+    _gather_coarse(*rows, source is not render, _array(coarse))
+    _gather_fine(rows[0], rows[1], rows[3], _array(fine))
     return GatheredCells(coarse, fine)
+
+
+def _array(x: Tensor) -> np.ndarray:
+    """Return a tensor's values without copying; those of bfloat16, which NumPy does not know, as their bits in uint16."""
+    array: np.ndarray = (x.view(torch.uint16) if x.dtype == torch.bfloat16 else x).numpy()
+    return array
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _float(x):
+    """Return a float32 of one, or of the bits of a bfloat16."""
+    return np.uint32(np.uint32(x) << np.uint32(16)).view(np.float32) if isinstance(x, np.uint16) else x
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _write(values, out):
+    """Write a line of float32, as the bits of bfloat16 where ``out`` is of uint16: the nearest, of two as near the even one."""
+    if out.itemsize == 4:
+        for i in range(len(values)):
+            out[i] = values[i]
+        return
+    bits = values.view(np.uint32)
+    for i in range(len(values)):
+        rounded = (bits[i] + np.uint32(0x7FFF) + ((bits[i] >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16)
+        out[i] = rounded if bits[i] & np.uint32(0x7FFFFFFF) <= np.uint32(0x7F800000) else np.uint32(0x7FC0)  # or not a number
 
 
 @njit(cache=True, nogil=True)
 def _gather_coarse(render, opacity, sdmap, output, last_render, source, hidden, noise, coarse):
-    """Write the cells of 4 x 4 pixels; without ``noise`` the source is the render."""
-    batch, rows, columns, _ = coarse.shape
+    """Write the cells of 4 x 4 pixels of rows ``(B, H, W C)``; without ``noise`` the source is the render."""
+    batch, rows, columns, size = coarse.shape
     side, run = CELL, 3 * CELL  # pixels and values of a cell's row
     one, three = side * side, side * run  # values of a cell of one and of three channels
+    cell = np.zeros(size, np.float32)
     for b in range(batch):
         for i in range(rows):
             for j in range(columns):
-                cell = coarse[b, i, j]
                 for r in range(side):
-                    y, x, at = side * i + r, side * j, run * r
+                    y, x, at = side * i + r, run * j, run * r
                     for k in range(side):
-                        cell[three + side * r + k] = np.float32(2.0) * opacity[b, y, x + k, 0] - np.float32(1.0)
-                        for c in range(3):
-                            value = render[b, y, x + k, c]
-                            to = at + 3 * k + c
-                            cell[to] = value
-                            cell[three + one + to] = sdmap[b, y, x + k, c]
-                            cell[2 * three + one + to] = output[b, y, x + k, c]
-                            cell[3 * three + one + to] = last_render[b, y, x + k, c]
-                            cell[4 * three + one + to] = source[b, y, x + k, c] - value if noise else np.float32(0.0)
-                for c in range(hidden.shape[3]):
-                    cell[5 * three + one + c] = hidden[b, i, j, c]
+                        cell[three + side * r + k] = np.float32(2.0) * opacity[b, y, side * j + k] - np.float32(1.0)
+                    for k in range(run):
+                        cell[at + k] = render[b, y, x + k]
+                        cell[three + one + at + k] = sdmap[b, y, x + k]
+                        cell[2 * three + one + at + k] = output[b, y, x + k]
+                        cell[3 * three + one + at + k] = last_render[b, y, x + k]
+                        if noise:
+                            cell[4 * three + one + at + k] = source[b, y, x + k] - render[b, y, x + k]
+                channels = size - 5 * three - one
+                for c in range(channels):
+                    cell[5 * three + one + c] = hidden[b, i, channels * j + c]
+                _write(cell, coarse[b, i, j])
 
 
 @njit(cache=True, nogil=True)
 def _gather_fine(render, opacity, output, fine):
-    """Write the cells of 2 x 2 pixels."""
-    batch, rows, columns, _ = fine.shape
+    """Write the cells of 2 x 2 pixels of rows ``(B, H, W C)``."""
+    batch, rows, columns, size = fine.shape
     side, run = DETAIL, 3 * DETAIL
     one, three = side * side, side * run
+    cells = np.empty((columns, size), np.float32)
     for b in range(batch):
         for i in range(rows):
             for j in range(columns):
-                cell = fine[b, i, j]
+                cell = cells[j]
                 for r in range(side):
+                    y, x, at = side * i + r, run * j, run * r
                     for k in range(side):
-                        y, x = side * i + r, side * j + k
-                        cell[three + side * r + k] = np.float32(2.0) * opacity[b, y, x, 0] - np.float32(1.0)
-                        for c in range(3):
-                            cell[run * r + 3 * k + c] = render[b, y, x, c]
-                            cell[three + one + run * r + 3 * k + c] = output[b, y, x, c]
+                        cell[three + side * r + k] = np.float32(2.0) * opacity[b, y, side * j + k] - np.float32(1.0)
+                    for k in range(run):
+                        cell[at + k] = render[b, y, x + k]
+                        cell[three + one + at + k] = output[b, y, x + k]
+            _write(cells.reshape(-1), fine[b, i].reshape(-1))
 
 
-def gather_beside_cpu(references: Tensor, render: Tensor) -> BesideCells:
-    """Return the same as `nets.reference_blend.gather_beside`, of float32 tensors on the CPU, to rounding."""
-    b, k, h, w, _ = references.shape
+def gather_beside_cpu(references: Tensor, render: Tensor, scale: int = 1, dtype: torch.dtype = torch.float32) -> BesideCells:
+    """Return the same as `nets.reference_blend.gather_beside`, to rounding, of references of bytes ``scale`` times larger than the render.
+
+    They are ``(B, K, scale H, scale W, 4)`` uint8, and averaged over squares of pixels.
+    """
+    (b, k), (_, h, w, _) = references.shape[:2], render.shape
     sizes = [(n, h // side, w // side, side * side * CHANNELS) for n, side in ((b, CELL), (b, DETAIL), (b * k, CELL), (b * k, DETAIL))]
-    made = BesideCells(*(torch.empty(size) for size in sizes))
-    _gather_beside(np.ascontiguousarray(references.numpy()), np.ascontiguousarray(render.numpy()), *(part.numpy() for part in made))
+    made = BesideCells(*(torch.empty(size, dtype=dtype) for size in sizes))
+    lines = np.ascontiguousarray(references.numpy()).reshape(b, k, scale * h, -1)
+    _gather_beside(lines, np.ascontiguousarray(render.numpy()), scale, *(_array(part) for part in made))
     return made
 
 
 @njit(cache=True, nogil=True)
-def _gather_beside(references, render, mean4, mean2, each4, each2):
-    batch, count, height, width, _ = references.shape
-    share = np.float32(1.0) / np.float32(count)
-    row, mean = np.empty(CHANNELS * width, np.float32), np.empty(CHANNELS * width, np.float32)
+def _gather_beside(references, render, scale, mean4, mean2, each4, each2):
+    batch, count, height, width = references.shape[0], references.shape[1], render.shape[1], render.shape[2]
+    share, level = np.float32(1.0) / np.float32(count), np.float32(1.0) / np.float32(HALF * scale * scale)
+    size = CHANNELS * width
+    row, mean, said = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, mean4.dtype)
     for b in range(batch):
         for y in range(height):
             i4, i2, at4, at2 = y // CELL, y // DETAIL, (y % CELL) * CELL * CHANNELS, (y % DETAIL) * DETAIL * CHANNELS
+            own = render[b, y]
             mean[:] = np.float32(0.0)
             for k in range(count):
-                picture, own = references[b, k, y], render[b, y]
+                row[:] = np.float32(0.0)
+                for line in references[b, k, scale * y : scale * (y + 1)]:
+                    if scale == 1:
+                        for i in range(len(row)):
+                            row[i] = np.float32(line[i])
+                    else:
+                        for x in range(width):
+                            for i in range(scale * x, scale * (x + 1)):
+                                for c in range(CHANNELS):
+                                    row[CHANNELS * x + c] += np.float32(line[CHANNELS * i + c])
                 for x in range(width):
-                    holds = picture[x, 3]
+                    holds = row[CHANNELS * x + 3] * level * np.float32(0.5)
                     for c in range(3):
-                        row[CHANNELS * x + c] = (picture[x, c] - own[x, c]) * holds
+                        row[CHANNELS * x + c] = (row[CHANNELS * x + c] * level - np.float32(1.0) - own[x, c]) * holds
                     row[CHANNELS * x + 3] = holds
                 for i in range(len(row)):
                     mean[i] += row[i] * share
-                _put_runs(row, each4[b * count + k, i4], at4, CELL * CHANNELS)
-                _put_runs(row, each2[b * count + k, i2], at2, DETAIL * CHANNELS)
-            _put_runs(mean, mean4[b, i4], at4, CELL * CHANNELS)
-            _put_runs(mean, mean2[b, i2], at2, DETAIL * CHANNELS)
+                _write(row, said)
+                _put_runs(said, each4[b * count + k, i4], at4, CELL * CHANNELS)
+                _put_runs(said, each2[b * count + k, i2], at2, DETAIL * CHANNELS)
+            _write(mean, said)
+            _put_runs(said, mean4[b, i4], at4, CELL * CHANNELS)
+            _put_runs(said, mean2[b, i2], at2, DETAIL * CHANNELS)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -127,9 +173,9 @@ def _put_runs(row, cells, at, run):
 def likeness_cpu(sought: Tensor, shown: Tensor) -> Tensor:
     """Return the same as `nets.reference_blend.likeness`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
     reach = 2 * MATCH_CELLS + 1
-    out = torch.empty(*shown.shape[:3], reach * reach)
-    _likeness(*(np.ascontiguousarray(x.float().numpy()) for x in (sought, shown)), out.numpy())
-    return out.to(sought.dtype)
+    out = torch.empty(*shown.shape[:3], reach * reach, dtype=sought.dtype)
+    _likeness(*(np.ascontiguousarray(_array(x)) for x in (sought, shown)), _array(out))
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -140,17 +186,17 @@ def _likeness(sought, shown, out):
     count = images // sought.shape[0]
     around = np.zeros((height + 2 * border, channels, width + 2 * border), np.float32)
     own = np.empty((channels, width), np.float32)
-    alike = np.empty((reach * reach, width), np.float32)
+    alike, row = np.empty((reach * reach, width), np.float32), np.empty((width, reach * reach), np.float32)
     share = np.float32(1.0) / np.float32(channels)
     for n in range(images):
         for i in range(height):
             for j in range(width):
                 for c in range(channels):
-                    around[i + border, c, j + border] = shown[n, i, j, c]
+                    around[i + border, c, j + border] = _float(shown[n, i, j, c])
         for i in range(height):
             for j in range(width):
                 for c in range(channels):
-                    own[c, j] = sought[n // count, i, j, c] * share
+                    own[c, j] = _float(sought[n // count, i, j, c]) * share
             alike[:] = np.float32(0.0)
             for di in range(reach):
                 for c in range(channels):
@@ -161,14 +207,15 @@ def _likeness(sought, shown, out):
                             sums[j] += mine[j] * line[j + dj]
             for j in range(width):
                 for place in range(reach * reach):
-                    out[n, i, j, place] = alike[place, j]
+                    row[j, place] = alike[place, j]
+            _write(row.reshape(-1), out[n, i].reshape(-1))
 
 
 @torch.library.custom_op("simrun::offsets", mutates_args=(), device_types="cpu")
 def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
-    """Return the same as `nets.reference_blend.offsets`, of float32 tensors on the CPU, to rounding; it has no gradient."""
+    """Return the same as `nets.reference_blend.offsets`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
     out = torch.empty(at2.shape)
-    _offsets(at2.numpy(), np.ascontiguousarray(at4.numpy()), out.numpy())  # the first is a part of what the head says, read in its place
+    _offsets(_array(at2), np.ascontiguousarray(_array(at4)), out.numpy())  # the first is a part of what the head says, read in its place
     return out
 
 
@@ -184,13 +231,13 @@ def _offsets(at2, at4, out):
             other = max(i - 1, 0) if y % 2 == 0 else min(i + 1, at4.shape[1] - 1)
             for j in range(columns):
                 for c in range(axes):
-                    rows[j, c] = own * at4[n, i, j, c] + next_to * at4[n, other, j, c]
+                    rows[j, c] = own * _float(at4[n, i, j, c]) + next_to * _float(at4[n, other, j, c])
             for j in range(columns):
                 before, after = max(j - 1, 0), min(j + 1, columns - 1)
                 for c in range(axes):
                     half = own * rows[j, c]
-                    row[2 * axes * j + c] = half + next_to * rows[before, c] + at2[n, y, 2 * j, c]
-                    row[2 * axes * j + axes + c] = half + next_to * rows[after, c] + at2[n, y, 2 * j + 1, c]
+                    row[2 * axes * j + c] = half + next_to * rows[before, c] + _float(at2[n, y, 2 * j, c])
+                    row[2 * axes * j + axes + c] = half + next_to * rows[after, c] + _float(at2[n, y, 2 * j + 1, c])
             for x in range(len(row)):
                 fallen[x] = -two * abs(row[x])
             _exponentials(fallen)
@@ -200,84 +247,113 @@ def _offsets(at2, at4, out):
 
 
 def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1) -> tuple[Tensor, Tensor]:
-    """Return the same as `nets.reference_blend.mix` of `sources_of`, of float32 tensors on the CPU, to rounding."""
+    """Return the same as `nets.reference_blend.mix` of `sources_of`, on the CPU, to rounding; references are bytes."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
-    repaired_, references_ = (np.ascontiguousarray(x.numpy()) for x in (repaired, references))
-    _mix(repaired_, references_, *(part.numpy() for part in heads), scale, out.numpy(), recorded.numpy())
+    pixels = np.ascontiguousarray(references.numpy()).view(np.uint32)[..., 0]
+    _mix(np.ascontiguousarray(repaired.numpy()), pixels, *(_array(part) for part in heads), scale, out.numpy(), recorded.numpy())
     return out, recorded
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _mix(repaired, references, weight, offset_px, correction, scale, out, recorded):
-    """Blend a row at a time: where each pixel is looked up, what is found there, its share; all in float32, so that rows are vectors.
+    """Blend a row at a time: where each pixel is looked up, what is found there, its share; channel by channel, so that rows are vectors.
 
-    What the heads say is ``scale`` times coarser than the picture, offsets twice that, and is interpolated between the middles.
+    What the heads say is ``scale`` times coarser than the picture, offsets twice that, and is interpolated between the middles. A pixel of
+    a reference is one number, its first channel the lowest byte.
     """
-    batch, count, height, width, _ = references.shape
+    batch, count, height, width = references.shape
     one, zero, largest, nowhere = np.float32(1.0), np.float32(0.0), np.float32(LARGEST), np.float32(NOWHERE)
-    right, below = np.float32(width - 1), np.float32(height - 1)
+    level, half = np.float32(1.0 / HALF), np.float32(0.5 / HALF)
     y0, y1, fy = _between(height, scale)
     x0, x1, fx = _between(width, scale)
     v0, v1, fv = _between(height, scale * DETAIL)
     u0, u1, fu = _between(width, scale * DETAIL)
-    said, rows = np.empty((width, CHANNELS), np.float32), np.empty((width // (scale * DETAIL), 2), np.float32)
-    near, far = np.empty((width // scale, CHANNELS), np.float32), np.empty((width // scale, CHANNELS), np.float32)
-    total, share, found = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((width, CHANNELS), np.float32)
-    blended = np.empty((width, 3), np.float32)
+    rows, near = np.empty((2, width // (scale * DETAIL)), np.float32), np.empty((CHANNELS, width // scale), np.float32)
+    # What is said of the two coarser rows around a row of pixels, by whether their number is odd; the next row most often has the same.
+    moves, words = np.empty((count, 2, 2, width), np.float32), np.empty((count, 2, CHANNELS, width), np.float32)
+    row_of = np.empty((count, 4), np.int64)
+    place, corners, shares = np.empty((4, width), np.uint32), np.empty((4, width), np.uint32), np.empty((4, width), np.float32)
+    found, blended = np.empty((CHANNELS, width), np.float32), np.empty((3, width), np.float32)
+    total, share = np.empty(width, np.float32), np.empty(width, np.float32)
     for b in range(batch):
+        row_of[:] = -1
         for y in range(height):
             total[:] = one
-            blended[:] = repaired[b, y]
+            for x in range(width):
+                for c in range(3):
+                    blended[c, x] = repaired[b, y, x, c]
             for k in range(count):
-                upper, lower = offset_px[b, k, v0[y]], offset_px[b, k, v1[y]]
-                for j in range(rows.shape[0]):
-                    for c in range(2):
-                        rows[j, c] = np.float32(scale) * (upper[j, c] + fv[y] * (lower[j, c] - upper[j, c]))
-                image = references[b, k]
+                for row in (v0[y], v1[y]):
+                    if row_of[k, row % 2] != row:
+                        row_of[k, row % 2] = row
+                        for j in range(rows.shape[1]):
+                            for c in range(2):
+                                rows[c, j] = np.float32(scale) * offset_px[b, k, row, j, c]
+                        _stretched(rows, u0, u1, fu, moves[k, row % 2])
+                upper, lower = moves[k, v0[y] % 2], moves[k, v1[y] % 2]
                 for x in range(width):
-                    i, j = u0[x], u1[x]
-                    px = np.float32(x) + rows[i, 0] + fu[x] * (rows[j, 0] - rows[i, 0])
-                    py = np.float32(y) + rows[i, 1] + fu[x] * (rows[j, 1] - rows[i, 1])
-                    px, py = min(max(px, zero), right), min(max(py, zero), below)
+                    px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
+                    py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
+                    px, py = min(max(px, zero), np.float32(width - 1)), min(max(py, zero), np.float32(height - 1))
                     left, top = np.int32(px), np.int32(py)
                     a, g = px - np.float32(left), py - np.float32(top)
-                    upper, lower = image[top], image[min(top + 1, height - 1)]
-                    beside = min(left + 1, width - 1)
-                    a11 = g * a
-                    a01, a10 = a - a11, g - a11
-                    a00 = one - a - a10
-                    for c in range(CHANNELS):
-                        found[x, c] = a00 * upper[left, c] + a01 * upper[beside, c] + a10 * lower[left, c] + a11 * lower[beside, c]
-                _said(weight[b, k], correction[b, k], y0[y], near)
-                if scale == 1:
-                    said = near
-                else:
-                    _said(weight[b, k], correction[b, k], y1[y], far)
-                    for j in range(near.shape[0]):
-                        for c in range(CHANNELS):
-                            near[j, c] += fy[y] * (far[j, c] - near[j, c])
+                    shares[3, x] = g * a
+                    shares[1, x], shares[2, x] = a - shares[3, x], g - shares[3, x]
+                    shares[0, x] = one - a - shares[2, x]
+                    beside, under = min(left + 1, width - 1) - left, (min(top + 1, height - 1) - top) * width
+                    at = top * width + left
+                    place[0, x], place[1, x], place[2, x], place[3, x] = at, at + beside, at + under, at + beside + under
+                image = references[b, k].reshape(-1)
+                for corner in range(4):
                     for x in range(width):
-                        for c in range(CHANNELS):
-                            said[x, c] = near[x0[x], c] + fx[x] * (near[x1[x], c] - near[x0[x], c])
+                        corners[corner, x] = image[place[corner, x]]
+                for c in range(CHANNELS):
+                    shift = np.uint32(8 * c)
+                    for x in range(width):
+                        value = zero
+                        for corner in range(4):
+                            value += shares[corner, x] * np.float32(np.int32((corners[corner, x] >> shift) & np.uint32(255)))
+                        found[c, x] = value
+                for row in (y0[y], y1[y]):
+                    if row_of[k, 2 + row % 2] != row:
+                        row_of[k, 2 + row % 2] = row
+                        if scale == 1:
+                            _said(weight[b, k], correction[b, k], row, words[k, row % 2])
+                        else:
+                            _said(weight[b, k], correction[b, k], row, near)
+                            _stretched(near, x0, x1, fx, words[k, row % 2])
+                upper, lower = words[k, y0[y] % 2], words[k, y1[y] % 2]
                 for x in range(width):
-                    share[x] = min(said[x, 3], largest)
+                    share[x] = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
                 _exponentials(share)
                 for x in range(width):
-                    part = share[x] * min(max(found[x, 3], nowhere), one)
-                    total[x] += part
-                    for c in range(3):
-                        blended[x, c] += part * (found[x, c] + said[x, c])
+                    share[x] *= min(max(found[3, x] * half, nowhere), one)
+                    total[x] += share[x]
+                for c in range(3):
+                    for x in range(width):
+                        said = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
+                        blended[c, x] += share[x] * (found[c, x] * level - one + said)
             for x in range(width):
                 over = one / total[x]
                 for c in range(3):
-                    out[b, y, x, c] = blended[x, c] * over
+                    out[b, y, x, c] = blended[c, x] * over
                 recorded[b, y, x, 0] = max(one - over, zero)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _stretched(coarse, before, after, share, out):
+    """Write rows of pixels between coarser ones; see `_between`."""
+    for c in range(len(out)):
+        line = coarse[c]
+        for x in range(out.shape[1]):
+            first = line[before[x]]
+            out[c, x] = first + share[x] * (line[after[x]] - first)
 
 
 @njit(cache=True, nogil=True)
 def _between(length, scale):
     """Return for each pixel of a row or column the values before and after it, ``scale`` pixels wide, and the share of the second."""
-    before, after, share = np.empty(length, np.int32), np.empty(length, np.int32), np.empty(length, np.float32)
+    before, after, share = np.empty(length, np.uint32), np.empty(length, np.uint32), np.empty(length, np.float32)
     last = length // scale - 1
     for x in range(length):
         place = max((x + 0.5) / scale - 0.5, 0.0)
@@ -294,8 +370,8 @@ def _said(weight, correction, row, out):
     for j in range(weight.shape[1]):
         for half in range(DETAIL):
             for c in range(3):
-                out[DETAIL * j + half, c] = correction[i, j, 3 * (into + half) + c]
-            out[DETAIL * j + half, 3] = weight[i, j, into + half]
+                out[c, DETAIL * j + half] = _float(correction[i, j, 3 * (into + half) + c])
+            out[3, DETAIL * j + half] = _float(weight[i, j, into + half])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -321,40 +397,3 @@ def _exponentials(values):
         values[i] = p * f + np.float32(1.0)
     for i in range(len(values)):
         values[i] *= scale[i]
-
-
-def draw_and_gather() -> None:
-    """Draw a line and a car, carry a picture into another view and gather its cells: tiny cases of all kernels of what a fixer reads."""
-    from alpasim_plugin.core.geometry import se2
-    from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
-    from alpasim_plugin.fixers.trust import trust
-    from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
-    from alpasim_plugin.semantic_map.draw import draw_map
-    from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
-
-    side_px = 16
-    ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x
-    edge = np.array([[2.0, -1.0, 0.0], [9.0, 1.0, 0.0]])
-    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
-    T_world_car, box = se2(5.0, 0.0, 0.0, 0.8), Box(4.5, 1.9, 1.6)
-    camera = CameraSpec("front", side_px, side_px, K, ahead)
-    draw_map(prepare_map(LaneMap({}, road_edges=(edge,))), camera, ahead, [ActorBox(T_world_car, box, "car")], threads=1)
-
-    depth = np.ones((side_px, side_px), np.float32)
-    picture = Picture(K, ahead, np.zeros((side_px, side_px, 3), np.uint8), depth, {"car": T_world_car})
-    warp(picture, WarpTarget(K, ahead, depth, {"car": T_world_car}, {"car": box}))
-    for focal_px in (8.0, 80.0):  # the car fills a part of the picture's rows, and all of them
-        zoomed = np.array([[focal_px, 0, 8], [0, focal_px, 8], [0, 0, 1]])
-        on_boxes(depth.shape, place_boxes(depth.shape, zoomed, ahead, {"car": T_world_car}, {"car": box}).seen)
-
-    image = torch.zeros(1, side_px, side_px, 3)
-    state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image, image[..., :1])
-    gather_cells_cpu(image, image[..., :1], image, state, image + 1)
-    references, at2, at4 = torch.zeros(1, 1, side_px, side_px, 4), image[:, ::DETAIL, ::DETAIL, :2], image[:, ::CELL, ::CELL]
-    gather_beside_cpu(references, image)
-    said = at2[:, None].repeat(1, 1, 1, 1, 9)
-    weight, offset, correction = said.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-    heads = BlendHeads(weight, offsets_cpu(offset[:, 0], at4[..., :2])[:, None], correction)
-    likeness_cpu(at4, at4)
-    mix_cpu(image, references, heads)
-    trust(image[0].numpy(), image[0].numpy(), image[0, ..., 0].numpy())

@@ -6,6 +6,9 @@ with which two recorded frames agree: plane-sweeping stereo (Collins, 1996, "A s
 hypotheses a pixel. Where they agree equally well, or where only one frame is there, the ground is preferred.
 """
 
+# Numba's decorators are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +21,7 @@ import numpy.typing as npt
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
+from alpasim_plugin.plugins.kernels import njit
 
 I32 = npt.NDArray[np.int32]
 
@@ -86,15 +90,24 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
     nearer than `FREE_SHARE` of that, and the ray meets no actor's box. Arguments as of `carry`.
     """
-    height, width = target.depth.shape
     # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
     down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
     height_m = T_world_rig[:3, 2] @ (target.T_world_camera[:3, 3] - T_world_rig[:3, 3])
-    slope = down[0] * (np.arange(width) + 0.5) + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
-    z = np.divide(-height_m, slope, out=np.zeros_like(slope), where=slope < 0)
-    free = (target.depth <= 0) | (target.depth >= FREE_SHARE * z)
-    free &= (z > NEAREST_M) & (z < FARTHEST_M) & ~on_boxes((height, width), target.placed.seen)
-    return np.where(free, z, 0).astype(np.float32)
+    out = np.empty(target.depth.shape, np.float32)
+    _ground(np.ascontiguousarray(target.depth), down, height_m, out)
+    out[on_boxes(target.depth.shape, target.placed.seen)] = 0
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ground(depth, down, height_m, out):
+    for row in range(out.shape[0]):
+        below = down[1] * (row + 0.5) + down[2]
+        for column in range(out.shape[1]):
+            slope, surface = down[0] * (column + 0.5) + below, np.float64(depth[row, column])
+            z = -height_m / slope if slope < 0 else 0.0
+            free = (z > NEAREST_M) & (z < FARTHEST_M) & ((surface <= 0) | (surface >= FREE_SHARE * z))
+            out[row, column] = z if free else 0.0
 
 
 def with_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -36,7 +37,7 @@ class PixelInputs:
     render: Tensor  # (B, H, W, 3) in [-1, 1]
     opacity: Tensor  # (B, H, W, 1), 0 to 1
     sdmap: Tensor  # (B, H, W, 3) in [-1, 1]; black where there is no map
-    references: Tensor | None = None  # (B, K, H, W, 4) colour in [-1, 1], and where it holds, 0 to 1
+    references: Tensor | None = None  # (B, K, H, W, 4) uint8, colour and where it holds
     scale: int = 1  # the network looks at pictures that are this many times smaller
 
 
@@ -193,7 +194,8 @@ class PixelFixer(Fixer):
 
         joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True))) if len(states) > 1 else states[0]
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
-        images = after.output[:, :height, :width].add(1).mul_(HALF).round_().to(torch.uint8).cpu().numpy()
+        shown = after.output[:, :height, :width].cpu().numpy()
+        images = np.stack([cv2.convertScaleAbs(one, alpha=HALF, beta=HALF) for one in shown])
         found = []
         for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
             before = None if past is None else (past.fixed, past.raw)
@@ -232,6 +234,5 @@ def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -
         padded = view.references[:, 0]
         if right or below:
             padded = np.pad(padded, ((0, 0), (0, 0), (0, below), (0, right), (0, 0)))
-        references = torch.from_numpy(padded).to(device).float().mul_(1 / HALF).sub_(1)
-        references[..., 3:].add_(1).mul_(0.5)
+        references = torch.from_numpy(padded).to(device)
     return PixelInputs(render, opacity, sdmap, references, scale)

@@ -18,6 +18,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -27,9 +28,11 @@ from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.views import HALF
 from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
 from alpasim_plugin.nets.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
-from alpasim_plugin.nets.reference_blend import BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
+from alpasim_plugin.nets.pixel_layers import pack
+from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -68,6 +71,8 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     else:
         net, trained, note = _untrained(settings), False, f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
+    if device == "cpu" and torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
+        pack(net)
     if device == "cpu" and net.blend is not None:
         net.blend.likeness, net.blend.offsets = likeness_cpu, offsets_cpu
     step = RecordedStep(net) if device == "cpu" else GeneratorStep(net)
@@ -115,16 +120,14 @@ class GeneratorStep:
         """Return the clean frame and the state after it; see `PixelGenerator.forward`, whose arguments these are.
 
         Args:
-            render, opacity, sdmap, state, source, references, t: Sides are multiples of 16 ``scale``.
+            render, opacity, sdmap, state, source, references, t: Sides are multiples of 16 ``scale``; references are bytes.
             scale: The network looks at pictures that are this many times smaller.
         """
         seen = smaller(render, scale)
         past = state._replace(output=smaller(state.output, scale), render=smaller(state.render, scale))
-        warped = None
-        if references is not None and self.net.blend is not None:
-            warped = smaller(references.flatten(0, 1), scale).reshape(*references.shape[:2], *seen.shape[1:3], -1)
+        beside = None if references is None or self.net.blend is None else self.beside(references, seen, scale)
         noised = seen if source is render else smaller(source, scale)
-        made = self.before_blend(seen, smaller(opacity, scale), smaller(sdmap, scale), past, noised, warped, t)
+        made = self.before_blend(seen, smaller(opacity, scale), smaller(sdmap, scale), past, noised, beside, t)
         out, recorded = made.repaired, torch.zeros_like(render[..., :1])
         if scale > 1:
             out = render + larger(made.repaired - seen, scale)
@@ -132,16 +135,27 @@ class GeneratorStep:
             out, recorded = self.mix(out, references, made.heads, scale)
         return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
 
+    def beside(self, references: Tensor, render: Tensor, scale: int) -> BesideCells:
+        """Gather what the network reads of references that are ``scale`` times larger than the render."""
+        seen = smaller(in_floats(references).flatten(0, 1), scale)
+        return gather_beside(seen.view(*references.shape[:2], *seen.shape[1:]), render)
+
     def before_blend(
-        self, render: Tensor, opacity: Tensor, sdmap: Tensor, past: PixelState, source: Tensor, warped: Tensor | None, t: Tensor | None
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        past: PixelState,
+        source: Tensor,
+        beside: BesideCells | None,
+        t: Tensor | None,
     ) -> BeforeBlend:
         """Run the network on what it looks at."""
-        beside = None if warped is None else gather_beside(warped, render)
         return self.net.before_blend(gather_cells(render, opacity, sdmap, past, source), render, past, t, beside)
 
     def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int) -> tuple[Tensor, Tensor]:
         """Blend at full size; see `nets.reference_blend`."""
-        return mix(sources_of(repaired, references, heads, scale))
+        return mix(sources_of(repaired, in_floats(references), heads, scale))
 
 
 class RecordedStep(GeneratorStep):
@@ -158,16 +172,26 @@ class RecordedStep(GeneratorStep):
         self._calls: Counter[tuple[int, ...]] = Counter()
         self.recorded: dict[tuple[int, ...], Any] = {}
 
+    def beside(self, references: Tensor, render: Tensor, scale: int) -> BesideCells:
+        """Gather in one compiled pass."""
+        return gather_beside_cpu(references, render, scale, self.net.stem.weight.dtype)
+
     def before_blend(
-        self, render: Tensor, opacity: Tensor, sdmap: Tensor, past: PixelState, source: Tensor, warped: Tensor | None, t: Tensor | None
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        past: PixelState,
+        source: Tensor,
+        beside: BesideCells | None,
+        t: Tensor | None,
     ) -> BeforeBlend:
         """Run the network, or its recording, on what it looks at."""
-        beside = () if warped is None else gather_beside_cpu(warped, render)
-        cells = gather_cells_cpu(render, opacity, sdmap, past, source)
+        cells, read = gather_cells_cpu(render, opacity, sdmap, past, source, self.net.stem.weight.dtype), beside or ()
         if t is not None:
-            return self.net.before_blend(cells, render, past, t, BesideCells(*beside) if beside else None)
-        tensors = *cells, render, *past, *beside
-        shape = *render.shape, *(part.shape[0] for part in beside)
+            return self.net.before_blend(cells, render, past, t, beside)
+        tensors = *cells, render, *past, *read
+        shape = *render.shape, *(part.shape[0] for part in read)
         self._calls[shape] += 1
         if self._after is not None and shape not in self.recorded and self._calls[shape] > self._after:
             self.recorded[shape] = _record(self._step, tensors)
@@ -177,6 +201,11 @@ class RecordedStep(GeneratorStep):
     def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int) -> tuple[Tensor, Tensor]:
         """Blend at full size in one compiled pass."""
         return mix_cpu(repaired, references, heads, scale)
+
+
+def in_floats(references: Tensor) -> Tensor:
+    """Return references of bytes ``(..., 4)`` as the network takes them: colour in [-1, 1], and where it holds, 0 to 1."""
+    return torch.cat([references[..., :3] / HALF - 1, references[..., 3:] / (2 * HALF)], dim=-1)
 
 
 def smaller(x: Tensor, scale: int) -> Tensor:
@@ -220,3 +249,42 @@ def _record(step: _Step, tensors: tuple[Tensor, ...]) -> Any:
         warnings.simplefilter("ignore", DeprecationWarning)
         plain = tuple(tensor.clone() for tensor in tensors)  # a recording of inference tensors could not be frozen
         return torch.jit.freeze(torch.jit.trace(step, plain, check_trace=False))  # type: ignore[no-untyped-call]
+
+
+def draw_and_gather() -> None:
+    """Draw a line and a car, carry a picture into another view and gather its cells: tiny cases of all kernels of what a fixer reads."""
+    from alpasim_plugin.core.geometry import se2
+    from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
+    from alpasim_plugin.fixers.ground import carry
+    from alpasim_plugin.fixers.trust import trust
+    from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes
+    from alpasim_plugin.semantic_map.draw import draw_map
+    from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
+
+    side_px = 16
+    ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x
+    edge = np.array([[2.0, -1.0, 0.0], [9.0, 1.0, 0.0]])
+    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
+    T_world_car, box = se2(5.0, 0.0, 0.0, 0.8), Box(4.5, 1.9, 1.6)
+    camera = CameraSpec("front", side_px, side_px, K, ahead)
+    draw_map(prepare_map(LaneMap({}, road_edges=(edge,))), camera, ahead, [ActorBox(T_world_car, box, "car")], threads=1)
+
+    depth = np.ones((side_px, side_px), np.float32)
+    picture = Picture(K, ahead, np.zeros((side_px, side_px, 3), np.uint8), depth, {"car": T_world_car})
+    carry([picture], WarpTarget(K, ahead, depth, {"car": T_world_car}, {"car": box}), np.eye(4))
+    for focal_px in (8.0, 80.0):  # the car fills a part of the picture's rows, and all of them
+        zoomed = np.array([[focal_px, 0, 8], [0, focal_px, 8], [0, 0, 1]])
+        on_boxes(depth.shape, place_boxes(depth.shape, zoomed, ahead, {"car": T_world_car}, {"car": box}).seen)
+
+    image, references = torch.zeros(1, side_px, side_px, 3), torch.zeros(1, 1, side_px, side_px, 4, dtype=torch.uint8)
+    state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image, image[..., :1])
+    for dtype in (torch.float32, torch.bfloat16):
+        gather_cells_cpu(image, image[..., :1], image, state, image + 1, dtype)
+        gather_beside_cpu(references, image, 1, dtype)
+        at2, at4 = (image[:, ::side, ::side].to(dtype) for side in (DETAIL, CELL))
+        said = at2[:, None, ..., :1].repeat(1, 1, 1, 1, 18)
+        weight, offset, correction = said[..., :4], said[..., 4:6], said[..., 6:]
+        heads = BlendHeads(weight, offsets_cpu(offset[:, 0], at4[..., :2])[:, None], correction)
+        likeness_cpu(at4, at4)
+        mix_cpu(image, references, heads)
+    trust(image[0].numpy(), image[0].numpy(), image[0, ..., 0].numpy())

@@ -44,14 +44,15 @@ def _add_shares(output, render, recorded, side, sums):
     scale = np.float32(1 / (3 * MADE_UP))
     height, width = recorded.shape
     for row in range(height):
-        for column in range(width):
-            apart = abs(output[row, column, 0] - render[row, column, 0])
-            apart += abs(output[row, column, 1] - render[row, column, 1])
-            apart += abs(output[row, column, 2] - render[row, column, 2])
-            share = recorded[row, column]
-            cell = sums[row // side, column // side]
-            cell[0] += share
-            cell[1] += min(apart * scale, np.float32(1.0)) * (np.float32(1.0) - share)
+        for first in range(0, width, side):
+            cell = sums[row // side, first // side]
+            for column in range(first, min(first + side, width)):
+                apart = abs(output[row, column, 0] - render[row, column, 0])
+                apart += abs(output[row, column, 1] - render[row, column, 1])
+                apart += abs(output[row, column, 2] - render[row, column, 2])
+                share = recorded[row, column]
+                cell[0] += share
+                cell[1] += min(apart * scale, np.float32(1.0)) * (np.float32(1.0) - share)
 
 
 def trust_cells(text: str) -> U8:

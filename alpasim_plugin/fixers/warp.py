@@ -144,7 +144,7 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     """
     depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share, seen = lookup
     height, width = depth.shape
-    x, y, held = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    x, y, held = np.empty((height, width), np.float32), np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
     # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is linear along a row.
     ray = T_world_camera[:3, :3] @ np.linalg.inv(K)
     project = K_then @ T_then_world[:3]
@@ -153,7 +153,8 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     _coordinates(lines, then, A, b, free_share, x, y, held)
     seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, depth.shape) if seen is None else seen
     to_then: F64 = project @ T_then_box
-    for i in reversed(range(len(sizes))):  # of two boxes the first counts
+    shown = np.flatnonzero((seen.pixels[:, ::2] < seen.pixels[:, 1::2]).all(axis=1))
+    for i in reversed(shown):  # of two boxes the first counts
         part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
         images = x[part], y[part], held[part]
         _coordinates_on_box(lines[part], then, seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i], free_share, *images)

@@ -29,6 +29,7 @@ from alpasim_plugin.core.types import F32, I64, U8
 from alpasim_plugin.nets.checkpoints import listed, weight
 from alpasim_plugin.nets.pixel_layers import (
     Conv3,
+    Dense,
     Downsample,
     FrameMemory,
     MemoryState,
@@ -230,11 +231,11 @@ class PixelGenerator(nn.Module):
         self.sizes = sizes
         at4, at8, at16 = sizes.widths
         depth = sizes.blocks
-        self.stem = nn.Linear(CELL**2 * IMAGES + sizes.hidden, at4)
+        self.stem = Dense(CELL**2 * IMAGES + sizes.hidden, at4)
         self.mix = Conv3(at4, at4)
         self.encode4 = _blocks(at4, depth[0])
         self.down8 = Downsample(at4, at8)
-        self.time = nn.Linear(2, at8, bias=False)
+        self.time = Dense(2, at8, bias=False)
         self.encode8 = _blocks(at8, depth[1])
         self.down16 = Downsample(at8, at16)
         self.middle = _blocks(at16, depth[2])
@@ -243,9 +244,9 @@ class PixelGenerator(nn.Module):
         self.decode8 = _blocks(at8, depth[3])
         self.up4 = Upsample(at8, at4)
         self.decode4 = _blocks(at4, depth[4])
-        self.remember = nn.Linear(at4, sizes.hidden) if sizes.hidden else None
+        self.remember = Dense(at4, sizes.hidden) if sizes.hidden else None
         self.up2 = Upsample(at4, sizes.detail)
-        self.read = nn.Linear(DETAIL**2 * DETAIL_IMAGES, sizes.detail)
+        self.read = Dense(DETAIL**2 * DETAIL_IMAGES, sizes.detail)
         self.refine = Conv3(sizes.detail, sizes.detail)
         self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
         repeat_per_pixel(self.write, DETAIL)
@@ -342,7 +343,7 @@ class PixelGenerator(nn.Module):
         y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
         fine = activation(read.add_(self.up2(y)), inplace=True)
-        fine = activation(self.refine(fine), inplace=True)
+        fine = self.refine(fine, activated=True)
         heads = self.blend(y, fine, beside) if self.blend is not None and beside is not None else None
         return BeforeBlend(pixels(self.write(fine), DETAIL).float() + render, hidden, kept, frames, heads)
 

@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.nets.pixel_layers import Conv3, Upsample, activation, cells, pixels
+from alpasim_plugin.nets.pixel_layers import Conv3, Dense, Upsample, activation, cells, pixels
 
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
 CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
@@ -44,7 +44,7 @@ class BesideCells(NamedTuple):
 
 
 class BlendHeads(NamedTuple):
-    """How references enter the picture, at half its resolution; float32."""
+    """How references enter the picture, at half its resolution; offsets in float32."""
 
     weight: Tensor  # (B, K, H / 2, W / 2, 4) logarithm of each pixel's weight over that of the repaired render, `cells` of one channel
     offset_px: Tensor  # (B, K, H / 2, W / 2, 2) x and y of where it is looked up
@@ -62,18 +62,18 @@ class ReferenceBlend(nn.Module):
 
     def __init__(self, coarse: int, detail: int, width: int) -> None:
         super().__init__()
-        self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
-        self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
-        self.coarse = nn.Linear(CELL**2 * CHANNELS, coarse)
-        self.sought = nn.Linear(coarse, MATCH_CHANNELS, bias=False)
+        self.stem = Dense(CELL**2 * CHANNELS, coarse, bias=False)
+        self.read = Dense(DETAIL**2 * CHANNELS, detail, bias=False)
+        self.coarse = Dense(CELL**2 * CHANNELS, coarse)
+        self.sought = Dense(coarse, MATCH_CHANNELS, bias=False)
         self.shown = Conv3(coarse, MATCH_CHANNELS)
-        self.match = nn.Linear((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
+        self.match = Dense((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
         self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
-        self.shift = nn.Linear(width, 2)
+        self.shift = Dense(width, 2)
         self.up = Upsample(width, detail)
-        self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
+        self.own = Dense(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
-        self.write = nn.Linear(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        self.write = Dense(width, DETAIL**2 + 2 + DETAIL**2 * 3)
         # Where no gradient is asked for, faster ones may stand here.
         self.likeness: Callable[[Tensor, Tensor], Tensor] = likeness
         self.offsets: Callable[[Tensor, Tensor], Tensor] = offsets
@@ -103,11 +103,11 @@ class ReferenceBlend(nn.Module):
         side = activation(_added(self.coarse(beside.each4.to(y.dtype)), y), inplace=True)
         alike = self.likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
-        at4 = activation(self.align[1](at4), inplace=True)
+        at4 = self.align[1](at4, activated=True)
         joined = _added(self.own(beside.each2.to(fine.dtype)).add_(self.up(at4)), fine)
-        said = self.write(activation(self.head(activation(joined, inplace=True)), inplace=True)).float()
+        said = self.write(self.head(activation(joined, inplace=True), activated=True))
         weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-        return BlendHeads(weight, self.offsets(offset.flatten(0, 1), self.shift(at4).float()).view(offset.shape), correction)
+        return BlendHeads(weight, self.offsets(offset.flatten(0, 1), self.shift(at4)).view(offset.shape), correction)
 
 
 def likeness(sought: Tensor, shown: Tensor) -> Tensor:
@@ -130,8 +130,8 @@ def likeness(sought: Tensor, shown: Tensor) -> Tensor:
 
 def offsets(at2: Tensor, at4: Tensor) -> Tensor:
     """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are said at half the resolution and, coarser, at a quarter of it."""
-    finer = F.interpolate(at4.permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
-    return torch.tanh(at2 + finer.permute(0, 2, 3, 1)) * OFFSET_PX
+    finer = F.interpolate(at4.float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+    return torch.tanh(at2.float() + finer.permute(0, 2, 3, 1)) * OFFSET_PX
 
 
 class Sources(NamedTuple):
@@ -153,7 +153,7 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
-    weight, correction = (enlarged(pixels(part, DETAIL), scale) for part in (weight, correction))
+    weight, correction = (enlarged(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction))
     moved = _sampled(references.flatten(0, 1), scale * offset_px)
     colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)

@@ -36,7 +36,7 @@ COMPILED = MADE / "compiled"
 SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
     "rasteriser": "alpasim_plugin.gaussians.sample_scene:rasterise",
     "gradient": "alpasim_plugin.gaussians.sample_scene:fit",
-    "map": "alpasim_plugin.fixers.gather:draw_and_gather",
+    "map": "alpasim_plugin.fixers.pixel_network:draw_and_gather",
 }
 # Level, best first -> what a processor must have, and how the code differs from what the level's name alone gives.
 V3 = frozenset({"avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"})

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
+from alpasim_plugin.fixers.pixel_network import in_floats, smaller
 from alpasim_plugin.nets.pixel_generator import PixelState, gather_cells
 from alpasim_plugin.nets.reference_blend import BlendHeads, gather_beside, likeness, mix, offsets, sources_of
 
@@ -25,14 +26,36 @@ def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Te
     return render, image(height, width, 1).abs(), sdmap, state
 
 
+def recordings(batch: int, references: int, height: int, width: int) -> Tensor:
+    """References that hold, do not, or by half."""
+    draw = torch.Generator().manual_seed(height + references)
+    out = torch.randint(0, 256, (batch, references, height, width, 4), dtype=torch.uint8, generator=draw)
+    out[..., 3] = torch.tensor([0, 128, 255], dtype=torch.uint8)[(out[..., 3] % 3).long()]
+    return out
+
+
 @pytest.mark.parametrize(("batch", "height", "width", "hidden"), [(1, 16, 16, 16), (3, 32, 48, 16), (2, 16, 80, 0)])
 @pytest.mark.parametrize("noisy", [True, False])
 def test_one_pass_gathers_the_same_bits(batch: int, height: int, width: int, hidden: int, noisy: bool) -> None:
     render, opacity, sdmap, state = images(batch, height, width, hidden)
     source = render * 0.25 if noisy else render
-    fast, plain = (gather(render, opacity, sdmap, state, source) for gather in (gather_cells_cpu, gather_cells))
+    given = render, opacity, sdmap, state, source
+    fast, plain = gather_cells_cpu(*given, torch.float32), gather_cells(*given)
     assert torch.equal(fast.coarse, plain.coarse)
     assert torch.equal(fast.fine, plain.fine)
+    half = gather_cells_cpu(*given, torch.bfloat16)
+    assert torch.equal(half.coarse, plain.coarse.bfloat16())
+    assert torch.equal(half.fine, plain.fine.bfloat16())
+
+
+def test_values_are_rounded_to_bfloat16_as_torch_rounds_them() -> None:
+    bits = torch.tensor(
+        [0x3F808000, 0x3F818000, 0x3F808001, 0x3F807FFF, 0x7F7FFFFF, 0x80000001, 0x7F800000, 0x7F800001, -1], dtype=torch.int64
+    )
+    render, opacity, sdmap, state = images(1, 16, 16, 16)
+    state.hidden[0, 0, 0, : len(bits)] = bits.to(torch.int32).view(torch.float32)
+    half = gather_cells_cpu(render, opacity, sdmap, state, render, torch.bfloat16).coarse[0, 0, 0, -16:]
+    assert torch.equal(half.nan_to_num(7.0), state.hidden[0, 0, 0].bfloat16().nan_to_num(7.0))
 
 
 def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -> None:
@@ -45,33 +68,39 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
         sdmap[half],
         state._replace(output=state.output[half], render=state.render[half], hidden=state.hidden[:, :4, :8]),
     )
-    fast, plain = (gather(*views, views[2]) for gather in (gather_cells_cpu, gather_cells))
+    fast, plain = gather_cells_cpu(*views, views[2], torch.float32), gather_cells(*views, views[2])
     assert torch.equal(fast.coarse.nan_to_num(7.0), plain.coarse.nan_to_num(7.0))
     assert torch.equal(fast.fine.nan_to_num(7.0), plain.fine.nan_to_num(7.0))
 
 
 @pytest.mark.parametrize(
     ("batch", "references", "height", "width", "scale"),
-    [(1, 1, 16, 16, 1), (2, 3, 32, 48, 1), (1, 4, 16, 80, 1), (2, 2, 32, 64, 2), (1, 1, 48, 96, 3), (1, 2, 16, 32, 8)],
+    [(1, 1, 16, 16, 1), (2, 3, 32, 48, 1), (1, 4, 16, 80, 1), (2, 2, 32, 64, 2), (1, 1, 48, 96, 3), (1, 2, 32, 64, 8)],
 )
 def test_one_pass_mixes_as_the_operations_one_by_one(batch: int, references: int, height: int, width: int, scale: int) -> None:
     draw = torch.Generator().manual_seed(height + references)
     repaired = torch.rand(batch, height, width, 3, generator=draw) * 2 - 1
-    images = torch.rand(batch, references, height, width, 4, generator=draw)
-    images[..., :3] = images[..., :3] * 2 - 1
-    images[..., 3] = (images[..., 3] * 3).floor() / 2  # 0, one half, 1
+    images = recordings(batch, references, height, width)
     at2 = (batch, references, height // (2 * scale), width // (2 * scale))
     heads = BlendHeads(*(torch.randn(*at2, n, generator=draw) * size for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))))
-    for one, other in zip(gather_beside_cpu(images, repaired), gather_beside(images, repaired), strict=True):
-        assert torch.allclose(one, other, atol=1e-6)
-    exact = BlendHeads(*(part.double() for part in heads))  # in float32 the operations one by one are ten times less exact
-    fast, plain = mix_cpu(repaired, images, heads, scale), mix(sources_of(repaired.double(), images.double(), exact, scale))
-    assert torch.allclose(fast[0].double(), plain[0], atol=4e-5)
-    assert torch.allclose(fast[1].double(), plain[1], atol=4e-5)
+    seen, floats = repaired[:, : height // scale, : width // scale], in_floats(images)
+    beside = gather_beside(smaller(floats.flatten(0, 1), scale).unflatten(0, images.shape[:2]), seen)
+    for dtype, share in ((torch.float32, 0.0), (torch.bfloat16, 2**-8)):
+        for one, other in zip(gather_beside_cpu(images, seen, scale, dtype), beside, strict=True):
+            assert one.dtype == dtype
+            assert torch.allclose(one.float(), other, atol=2e-6, rtol=share)
+    exact = BlendHeads(*(part.double() for part in heads))  # in float32 the operations one by one are less exact
+    fast, plain = mix_cpu(repaired, images, heads, scale), mix(sources_of(repaired.double(), floats.double(), exact, scale))
+    for one, other in zip(fast, plain, strict=True):  # at the edge of what holds, a rounded offset weighs more than the rounding itself
+        assert float((one - other).abs().quantile(0.99)) < 1e-5
+        assert float((one - other).abs().max()) < 1e-3
+    half = BlendHeads(heads.weight.bfloat16(), heads.offset_px, heads.correction.bfloat16())  # read as they are
+    for one, other in zip(mix_cpu(repaired, images, half, scale), mix(sources_of(repaired, floats, half, scale)), strict=True):
+        assert torch.allclose(one, other, atol=2e-3)
 
 
 def test_a_reference_with_an_enormous_weight_is_the_picture_and_nothing_overflows() -> None:
-    repaired, images = torch.zeros(1, 16, 16, 3), torch.ones(1, 2, 16, 16, 4)
+    repaired, images = torch.zeros(1, 16, 16, 3), torch.full((1, 2, 16, 16, 4), 255, dtype=torch.uint8)
     heads = BlendHeads(torch.full((1, 2, 8, 8, 4), 200.0), torch.zeros(1, 2, 8, 8, 2), torch.zeros(1, 2, 8, 8, 12))
     out, recorded = mix_cpu(repaired, images, heads)
     assert torch.allclose(out, torch.ones_like(out), atol=1e-5)
@@ -96,15 +125,17 @@ def test_offsets_are_joined_as_the_operations_one_by_one_do(images: int, height:
     at2 = torch.randn(images, height, width, 2, generator=draw) * 3
     at4 = torch.randn(images, height // 2, width // 2, 2, generator=draw)
     at2[0, 0, 0], at2[0, 1, 1] = torch.tensor([300.0, -300.0]), torch.tensor([1e-4, -0.0])
-    assert torch.allclose(offsets_cpu(at2, at4), offsets(at2, at4), atol=2e-5)
+    for dtype in (torch.float32, torch.bfloat16):
+        said = at2.to(dtype), at4.to(dtype)
+        assert torch.allclose(offsets_cpu(*said), offsets(*said), atol=2e-5)
 
 
 def test_weights_over_all_magnitudes_blend_as_in_float64() -> None:
     weight = torch.linspace(-100, 59, 8 * 8 * 4).view(1, 1, 8, 8, 4)
     draw = torch.Generator().manual_seed(5)
-    repaired, images = torch.rand(1, 16, 16, 3, generator=draw), torch.rand(1, 1, 16, 16, 4, generator=draw)
+    repaired, images = torch.rand(1, 16, 16, 3, generator=draw), recordings(1, 1, 16, 16)
     heads = BlendHeads(weight, torch.zeros(1, 1, 8, 8, 2), torch.zeros(1, 1, 8, 8, 12))
     out, recorded = mix_cpu(repaired, images, heads)
-    exact = mix(sources_of(repaired.double(), images.double(), BlendHeads(*(part.double() for part in heads))))
+    exact = mix(sources_of(repaired.double(), in_floats(images).double(), BlendHeads(*(part.double() for part in heads))))
     assert torch.allclose(out.double(), exact[0], atol=1e-6)
     assert torch.allclose(recorded.double(), exact[1], atol=1e-6)

@@ -9,7 +9,7 @@ import pytest
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.ground import carry, ground_hypothesis, with_users
+from alpasim_plugin.fixers.ground import FARTHEST_M, FREE_SHARE, NEAREST_M, carry, ground_hypothesis, with_users
 from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, on_boxes, place_boxes, plain_on_boxes, plain_points, warp
 
 WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
@@ -46,6 +46,17 @@ def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
 def recorded(x_m: float, wall_m: float = np.inf) -> Picture:
     T, depth, rgb = street(x_m, wall_m)
     return Picture(K, T, rgb, depth, NOBODY)
+
+
+def plain_ground(view: WarpTarget, T_world_rig: F64) -> F32:
+    """Do what `ground_hypothesis` does, array by array: the reference of its kernel."""
+    height, width = view.depth.shape
+    down = T_world_rig[:3, 2] @ view.T_world_camera[:3, :3] @ np.linalg.inv(view.K)
+    height_m = T_world_rig[:3, 2] @ (view.T_world_camera[:3, 3] - T_world_rig[:3, 3])
+    slope = down[0] * (np.arange(width) + 0.5) + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
+    z = np.divide(-height_m, slope, out=np.zeros_like(slope), where=slope < 0)
+    free = ((view.depth <= 0) | (view.depth >= FREE_SHARE * z)) & (z > NEAREST_M) & (z < FARTHEST_M)
+    return np.where(free & ~on_boxes((height, width), view.placed.seen), z, 0).astype(np.float32)
 
 
 def off(image: U8, truth: U8, where: tuple[slice, slice]) -> float:
@@ -134,3 +145,14 @@ def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m: float
     assert (depth > 0).any() == (height_m == 1.5)  # from too far above the road is no plane
     below = plain_points(depth, K, view.T_world_camera)[depth > 0] - T_world_rig[:3, 3]
     assert np.abs(below @ T_world_rig[:3, 2]).max(initial=0) < 1e-4
+
+
+@pytest.mark.parametrize(("roll", "height_m"), [(0.0, 1.5), (0.3, 0.4), (np.pi, 1.5), (0.0, -1.0), (0.0, 0.0)])
+def test_the_ground_of_a_camera_that_leans_is_what_plain_arithmetic_says(roll: float, height_m: float) -> None:
+    T = street(0.0)[0].copy()
+    T[:3, :3] = T[:3, :3] @ np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    T[2, 3] = height_m
+    depth = np.random.default_rng(1).uniform(-5, 60, street(0.0)[1].shape).astype(np.float32)
+    depth[::7] = np.nan
+    view = WarpTarget(K, T, depth, {"car": se2(9.0, 1.0, 0.0, 0.8)}, {"car": Box(4.5, 1.9, 1.6)})
+    assert np.array_equal(ground_hypothesis(view, rig(0.0)), plain_ground(view, rig(0.0)))

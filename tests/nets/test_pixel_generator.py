@@ -7,7 +7,7 @@ from torch import Tensor
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.machine_probe import choose_precision
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState, hole_mask, pixel_source, sparse_source
-from alpasim_plugin.nets.pixel_layers import Upsample, cells, pixels
+from alpasim_plugin.nets.pixel_layers import Conv3, Dense, Upsample, activation, cells, pack, pixels
 
 SMALL = PixelSizes((8, 12, 16), (1, 0, 2, 1, 1), 8, 4)
 
@@ -45,6 +45,24 @@ def test_an_upsampled_cell_starts_flat() -> None:
     out = Upsample(5, 3)(torch.randn(1, 4, 6, 5))
     assert out.shape == (1, 8, 12, 3)
     torch.testing.assert_close(out[:, ::2, ::2], out[:, 1::2, 1::2])
+
+
+@pytest.mark.parametrize(("dtype", "share"), [(torch.float32, 2e-6), (torch.bfloat16, 2**-7)])
+@pytest.mark.parametrize(("inputs", "outputs"), [(5, 3), (48, 24), (160, 160)])
+def test_a_packed_layer_computes_what_it_computed_before(inputs: int, outputs: int, dtype: torch.dtype, share: float) -> None:
+    layers = torch.nn.ModuleList([Conv3(inputs, outputs), Dense(inputs, outputs), Dense(inputs, outputs, bias=False)])
+    layers.requires_grad_(False).to(dtype)
+    conv, dense, bare = layers
+    x = torch.randn(2, 6, 9, inputs, dtype=dtype, generator=torch.Generator().manual_seed(inputs))
+    plain = conv(x), activation(conv(x)), dense(x), bare(x)
+    keys = layers.state_dict().keys()
+    pack(layers)
+    assert layers.state_dict().keys() == keys
+    for one, other in zip((conv(x), conv(x, activated=True), dense(x), bare(x)), plain, strict=True):
+        assert one.stride() == other.stride()
+        torch.testing.assert_close(one, other, rtol=share, atol=share)
+    x[1, 5, 8, 0] = float("nan")
+    assert conv(x, activated=True)[1, 5, 8].isnan().all()
 
 
 def test_weights_say_the_sizes() -> None:

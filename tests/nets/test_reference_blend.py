@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep
+from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep, in_floats
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
 from alpasim_plugin.nets.reference_blend import _sampled
 
@@ -69,11 +69,11 @@ def test_an_untrained_head_leaves_most_of_the_picture_to_the_generator() -> None
 def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None:
     net = trained_like()
     render, opacity, sdmap, images = inputs(references, batch)
-    given = images if references else None
+    given = (images.abs() * 255).byte() if references else None
     step = RecordedStep(net, after=1)
     for _ in range(3):
         fast, after = step(render, opacity, sdmap, net.start(render), render, given)
-    plain, state = call(net, render, opacity, sdmap, given)
+    plain, state = call(net, render, opacity, sdmap, None if given is None else in_floats(given))
     assert len(step.recorded) == 1
     # Where a reference ends, an offset that differs by rounding weighs more than the rounding itself.
     for a, b in ((fast, plain), (after.recorded, state.recorded)):
@@ -85,7 +85,7 @@ def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None
 def test_a_network_that_looks_at_smaller_pictures_blends_at_full_size(references: int) -> None:
     net = trained_like()
     render, opacity, sdmap, images = inputs(references, 2)
-    given = images if references else None
+    given = (images.abs() * 255).byte() if references else None
     plain, fast = GeneratorStep(net), RecordedStep(net, after=1)
     start = plain.start(render, 2)
     assert start.hidden.shape[1] * 2 == net.start(render).hidden.shape[1]
