@@ -44,4 +44,4 @@ def decode_image(data: bytes, what: str = "a camera image") -> U8:
         InputError: Not a whole image.
     """
     bgr = images.decode_image(data, what, "decoding a camera image", "store PNG or JPEG images in the log")
-    return np.ascontiguousarray(bgr[..., ::-1])
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
