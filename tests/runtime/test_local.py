@@ -69,6 +69,11 @@ def test_copies_answer_as_fresh_workers_do_and_have_what_was_loaded(repo: Path) 
     assert done.stdout == f"['A', {ended}, 'B']\n[(True, None)] False\n"
 
 
+def test_what_copies_share_is_nothing_that_their_collectors_look_through() -> None:
+    code = "import gc, alpasim_plugin.runtime.executors.ahead; print(gc.isenabled(), gc.get_freeze_count() > 10_000)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "True True\n"
+
+
 def loaded(module: str) -> tuple[bool, str | None]:
     return module in sys.modules, os.environ.get("PYTHONSAFEPATH")
 
