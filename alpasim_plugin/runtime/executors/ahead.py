@@ -11,7 +11,7 @@ from importlib import import_module
 NEEDED = (
     "alpasim_plugin.control.tracker", "alpasim_plugin.renderers.gaussian", "alpasim_plugin.runtime.execute",
     "evaluators.metrics.image_health", "evaluators.metrics.motion", "evaluators.metrics.offroad", "evaluators.metrics.outcomes",
-    "evaluators.metrics.plan", "policies.lane_camera", "pyarrow.dataset", "scipy.linalg.lapack", "scipy.spatial",
+    "evaluators.metrics.plan", "policies.lane_camera", "pyarrow.dataset", "scipy.linalg.lapack",
 )  # fmt: skip
 
 
