@@ -9,6 +9,7 @@ import ast
 import contextlib
 import difflib
 import errno
+import gc
 import json
 import os
 import re
@@ -163,6 +164,9 @@ def _run(args: list[str]) -> int:
     import typer
 
     command = typer.main.get_command(make_app(next(iter(args), None)))
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
     usage_error: Any = typer.BadParameter.__bases__[0]  # its module is another one in other versions of typer
     try:
         with stoppable(), command.make_context("simrun", list(args)) as context:
@@ -277,6 +281,7 @@ def load_workers_early(args: Sequence[str]) -> None:
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
+    gc.disable()  # until a verb is imported: that stays, and the collector need not look through it again and again
     if "_SIMRUN_COMPLETE" not in os.environ:
         with contextlib.suppress(SimrunError):  # it is raised again where errors are printed
             load_workers_early(sys.argv[1:])

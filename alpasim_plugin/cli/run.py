@@ -19,13 +19,11 @@ from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.io.limits import SOURCE_BYTES
 from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.run_folder.manifests import read_run_json
 from alpasim_plugin.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runtime.certificate import certificate_line, foreseen
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
-from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 from evaluators.statistics.arms import arms_of, base_named
@@ -130,7 +128,8 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
-    Console().print(render_table(result.summary, headline_only=True, known=MetricTable.of_run(read_run_json(result.root))))
+    run = read_run(result.root)
+    Console().print(render_table(result.summary, headline_only=True, known=run.table))
     for line in fixer_lines(result.summary):
         print(line)
     for line in plan_warnings(result.summary):
@@ -145,7 +144,6 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     if video != "none":
         print(f"videos   {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts")
     print(f"repeat   {certificate_line(result.summary['determinism'])}")
-    run = read_run(result.root)
     for line in ending_lines(run):
         print(line)
     print(report_line(result.root))

@@ -43,7 +43,7 @@ class RolloutTable:
     """The rollouts of one or several runs.
 
     Args:
-        data: Rows with the columns of ``rollouts.parquet``.
+        data: Rows with the columns of ``rollouts.parquet``, in memory or in files.
         where: What is read, for messages.
         reasons: Gives for a renderer and metric why values are not valid; empty where nobody knows.
 
@@ -53,7 +53,7 @@ class RolloutTable:
         n_rollouts: Rows.
     """
 
-    def __init__(self, data: pads.Dataset, where: str, reasons: Reasons = _unknown) -> None:
+    def __init__(self, data: pa.Table | pads.Dataset, where: str, reasons: Reasons = _unknown) -> None:
         self._data, self._where, self.reasons = data, where, reasons
         self.metrics = list(metrics_in(data.schema.names))
         self._kept: dict[str, F64] = {}
@@ -96,7 +96,7 @@ class RolloutTable:
     @classmethod
     def of_table(cls, table: pa.Table) -> RolloutTable:
         """Take a table in memory."""
-        return cls(pads.dataset(table), "a table of rollouts")
+        return cls(table, "a table of rollouts")
 
     def sides(self, policy: str, named: str | None = None) -> dict[str, RendererColumns]:
         """Return RENDERER -> its rollouts with a policy, in order of appearance.
@@ -137,7 +137,9 @@ class RolloutTable:
         return self._kept[metric]
 
     def _batches(self, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-        if columns:
+        if columns and isinstance(self._data, pa.Table):
+            yield from self._data.select(columns).to_batches(BATCH_ROWS)
+        elif columns:
             with parsing(DOING, self._where, AGAIN, "no readable parquet"):
                 yield from self._data.scanner(columns=list(columns), batch_size=BATCH_ROWS).to_batches()
 

@@ -236,7 +236,9 @@ def _is_suspicious(facts: Any, column: Column) -> bool:
         stats = facts.row_group(group).column(at).statistics
         if stats is None or not stats.has_null_count or (column.is_required and stats.null_count):
             return True
-        if column.least is not None and (not stats.has_min_max or not column.least <= stats.min <= stats.max <= column.most):
+        if column.least is None or stats.num_values == 0:  # of a chunk of nothing but nulls no least value is stated
+            continue
+        if not stats.has_min_max or not column.least <= stats.min <= stats.max <= column.most:
             return True
     return False
 

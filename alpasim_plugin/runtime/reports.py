@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.io.atomic import write_bytes, write_json
-from alpasim_plugin.log import decode_image, encode_image, read_asl
+from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, WHY_NAME, probe_folder
 from alpasim_plugin.viewer.cause import cause_of_log, write_cause
+from alpasim_plugin.viewer.cells import read_log
 from alpasim_plugin.viewer.page import write_flips_page
 from alpasim_plugin.viewer.pictures import smaller
 from evaluators.metrics.outcomes import outcomes_of
@@ -83,7 +83,6 @@ def write_flips(run_dir: Path | Run) -> Path:
     for number, flip in enumerate(flips[:MAX_FLIPS]):
         key = {"renderer": flip.other.renderer, "policy": flip.other.policy, "scene": flip.other.scene, "seed": flip.other.seed}
         cells.append(key | {"baseline": flip.base.renderer, "against": flip.base.variant} | _divergence(root, flip, f"flips/{number:03d}"))
-    _read.cache_clear()
     about = {"threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "n_flips": len(flips), "n_pairs": compared}
     write_json(root / FLIPS_NAME, about | {"cells": cells})
     return root / FLIPS_NAME
@@ -96,7 +95,7 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
     if not (flip.base.ok and flip.other.ok):
         return {"t_us": None, "reason": "the policy broke off one of the drives"}
     try:
-        logs = {name: _read(root / r.path / LOG_NAME) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)}
+        logs = {name: read_log(root / r.path / LOG_NAME) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)}
     except SimrunError as error:
         return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
     one, other = logs.values()
@@ -136,8 +135,3 @@ def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
     rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
     write_bytes(root / name, encode_image(smaller(rgb, PICTURE_WIDTH), "jpeg", 85))
     return name
-
-
-@lru_cache(maxsize=4)  # flips of several renderers share the baseline's log
-def _read(path: Path) -> RolloutLog:
-    return read_asl(path)

@@ -35,6 +35,7 @@ from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_bu
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
 from evaluators.statistics.families import grouped
@@ -167,8 +168,6 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
         more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made again.
         report: Write ``report.html``.
     """
-    from alpasim_plugin.runtime.reports import write_reports  # plotting libraries take a second to load, and a run needs them only now
-
     info = read_run_json(root)
     outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
     write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})

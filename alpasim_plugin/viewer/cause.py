@@ -18,10 +18,10 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
 from alpasim_plugin.core.types import F64, I64, U8, RolloutLog
 from alpasim_plugin.io.atomic import write_text
-from alpasim_plugin.log import decode_image, read_asl
+from alpasim_plugin.log import decode_image
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
-from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_logs
+from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_log, read_logs
 from alpasim_plugin.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from alpasim_plugin.viewer.page import as_json, fill
 from alpasim_plugin.viewer.pictures import frame_rows, jpeg, seen_before, smaller
@@ -270,7 +270,7 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
     path = run.file_of(rollout, LOG_NAME)
     if path is None:
         return None
-    log, failed_us = read_asl(path), failed_at(run.manifest(rollout))
+    log, failed_us = read_log(path), failed_at(run.manifest(rollout))
     partings = []
     for entry in told:
         kind = "renderer" if entry["baseline"] != rollout.renderer else "policy"

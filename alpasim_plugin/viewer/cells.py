@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -212,9 +213,19 @@ def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
         stated = run.manifest(rollout).get("log")  # as it was named to simrun score, so from the same working directory
         path = None if stated is None else Path(str(stated))
     try:
-        return read_asl(path) if path is not None and path.is_file() else None
+        return read_log(path) if path is not None and path.is_file() else None
     except SimrunError as error:
         return error  # the page says so in this rollout's place; the others are still shown
+
+
+def read_log(path: Path) -> RolloutLog:
+    """Read a log, or return what was read of it a moment ago: flips share their baseline's, and pages show what flips were found in."""
+    return _log_as_of(path, path.stat().st_mtime_ns if path.exists() else 0)
+
+
+@lru_cache(maxsize=4)
+def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
+    return read_asl(path)
 
 
 def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, camera: str | None = None) -> dict[str, Any]:

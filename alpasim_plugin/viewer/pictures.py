@@ -95,7 +95,8 @@ def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
 def jpeg(rgb: U8) -> str:
     """Encode a picture ``(H, W, 3)`` for a page, as base64."""
     # Halved colour resolution and optimised tables: a page is looked at, not measured.
-    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
         raise InputError("encoding a camera frame", f"array {rgb.shape}", "the encoder refused", "use smaller images")
     return base64.b64encode(data.tobytes()).decode()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
+import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Lane, LaneMap, Paint
@@ -48,8 +48,10 @@ class _Edges:
             headings.append((b - a) / np.maximum(np.linalg.norm(b - a, axis=1), 1e-12)[:, None])
         self.owner: I64 = np.concatenate(owner)
         self.headings: F64 = np.concatenate(headings)
-        tree = scipy.spatial.KDTree(np.concatenate(points))
-        self.near = tree.query_ball_point(tree.data, SAME_EDGE_M) if len(self.owner) else []
+        samples = shapely.points(np.concatenate(points))
+        of, near = shapely.STRtree(samples).query(samples, predicate="dwithin", distance=SAME_EDGE_M)
+        order = np.argsort(of, kind="stable")
+        self.near = np.split(near[order], np.searchsorted(of[order], np.arange(1, len(samples))))
 
     def beside(self, i: int) -> list[list[tuple[int, float]]]:
         """Return for every sample of edge ``i`` the other edges there, each with the cosine between the two headings."""

@@ -68,6 +68,23 @@ def test_a_listing_loads_no_numerical_library() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip().endswith("False")
 
 
+def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels() -> None:
+    """Its workers load what drives; while they are started, nothing else is to load here."""
+    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'torch', 'av'} & sys.modules.keys())"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
+
+
+def test_the_collector_is_off_while_a_verb_is_imported_and_on_while_it_runs() -> None:
+    code = (
+        "import gc, sys; from alpasim_plugin.cli import main\n"
+        "def make_app(verb, own=main.make_app):\n    print(gc.isenabled())\n    return own(verb)\n"
+        "main.make_app, sys.argv = make_app, ['simrun', 'list', 'renderers']\n"
+        "try:\n    main.main()\nfinally:\n    print(gc.isenabled(), gc.get_freeze_count() > 1000)"
+    )
+    lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert (lines[0], lines[-1]) == ("False", "True True")
+
+
 def test_the_listing_shows_every_verb_with_the_first_line_of_its_own_help() -> None:
     listed: Any = typer.main.get_command(make_app(None))
     assert set(listed.commands) == set(verbs())

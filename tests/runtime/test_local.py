@@ -69,6 +69,15 @@ def test_copies_answer_as_fresh_workers_do_and_have_what_was_loaded(repo: Path) 
     assert done.stdout == f"['A', {ended}, 'B']\n[(True, None)] False\n"
 
 
+def test_what_copies_share_is_what_a_drive_needs_and_nothing_that_their_collectors_look_through() -> None:
+    code = (
+        "import gc, sys, alpasim_plugin.runtime.executors.ahead\n"
+        "print(gc.isenabled(), gc.get_freeze_count() > 10_000)\n"
+        "print({'av', 'matplotlib', 'scipy.interpolate', 'scipy.spatial', 'scipy.special', 'torch'} & sys.modules.keys())"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "True True\nset()\n"
+
+
 def loaded(module: str) -> tuple[bool, str | None]:
     return module in sys.modules, os.environ.get("PYTHONSAFEPATH")
 

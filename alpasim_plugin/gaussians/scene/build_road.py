@@ -275,7 +275,8 @@ def _leaves(level: I64, floor: int) -> list[Bool | None]:
         h, w = least.shape
         if h % 2 or w % 2:
             break
-        least = least.reshape(h // 2, 2, w // 2, 2).min(axis=(1, 3))
+        least = np.minimum(least[0::2], least[1::2])
+        least = np.minimum(least[:, 0::2], least[:, 1::2])
     leaves: list[Bool | None] = []
     for k, mask in enumerate(can):
         if k < floor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -14,6 +15,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 Kind = Literal["clear", "overcast", "dusk"]
 WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
 LOW_RAD, HIGH_RAD = np.radians(-20.0), np.radians(70.0)
+BLOCK = 16  # rows that are painted at once
 STEP_PX = 8  # directions are computed this often and interpolated in between
 
 # zenith, middle, horizon, what shows below the horizon where the scene has a hole, cloud, hills
@@ -54,7 +56,8 @@ class Sky:
         forward = camera.T_camera_world[2, :3]
         ahead = np.arctan2(forward[1], forward[0])
         azimuth = ahead + _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
-        columns = _upsample(azimuth * (WIDTH / (2 * np.pi)), h, w) % WIDTH
+        columns = _upsample(azimuth * (WIDTH / (2 * np.pi)), h, w)
+        columns += np.float32(WIDTH) * (columns < 0)  # all lie within a turn of column 0: what % would give, in a tenth of its time
         rows = _upsample((HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)), h, w)
         return np.asarray(cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR))
 
@@ -65,10 +68,14 @@ def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
 
 def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
     """Interpolate values at every `STEP_PX`-th pixel corner to pixel centres."""
-    g = grid.astype(np.float32)
-    at = [(np.arange(n, dtype=np.float32) + 0.5) / STEP_PX for n in (height, width)]
-    rows, columns = np.broadcast_arrays(at[0][:, None], at[1][None, :])
-    return np.asarray(cv2.remap(g, np.ascontiguousarray(columns), np.ascontiguousarray(rows), cv2.INTER_LINEAR))
+    return np.asarray(cv2.remap(grid.astype(np.float32), *_pixel_centres(height, width), cv2.INTER_LINEAR))
+
+
+@lru_cache(maxsize=8)
+def _pixel_centres(height: int, width: int) -> tuple[F32, F32]:
+    """Return column and row ``(height, width)`` of every pixel's centre on the grid of `_upsample`."""
+    rows, columns = np.indices((height, width), dtype=np.float32)
+    return (columns + np.float32(0.5)) / np.float32(STEP_PX), (rows + np.float32(0.5)) / np.float32(STEP_PX)
 
 
 def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
@@ -79,25 +86,31 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     t = np.clip(up / 0.35, 0, 1)[:, None]
     high = np.clip((up - 0.35) / 0.65, 0, 1)[:, None]
     column = np.where(up[:, None] < 0.35, horizon * (1 - t) + middle * t, middle + (zenith - middle) * high)
-    image = np.repeat(column[:, None, :], WIDTH, axis=1)
     octaves = ((4, 12, 0.5), (9, 26, 0.3), (20, 60, 0.15), (44, 130, 0.08))
-    noise = np.sum([weight * _periodic_noise(rng, rows, columns) for rows, columns, weight in octaves], axis=0)
+    noise = np.zeros((HEIGHT, WIDTH))
+    for rows, columns, weight in octaves:
+        noise += weight * _periodic_noise(rng, rows, columns)
     # Clouds are seen flatter towards the horizon and vanish in its haze.
     threshold = np.quantile(noise, 1 - _CLOUD_SHARE[kind])
-    cover = np.clip((noise - threshold) / 0.45, 0, 1) * np.clip((up[:, None] - 0.05) / 0.15, 0, 1)
-    image += 0.85 * cover[..., None] * (cloud * (1 - 0.12 * np.clip(noise, 0, 1)[..., None]) - image)
-    ridge = np.radians(1.2) * (1 + 0.8 * _periodic_noise(rng, 1, 24)[:1] + 0.3 * _periodic_noise(rng, 1, 120)[:1])
-    below = np.clip((np.maximum(ridge, np.radians(0.3)) - elevation[:, None]) / np.radians(0.25), 0, 1)
-    image += below[..., None] * (hills - image)
-    field = np.clip((np.radians(0.0) - elevation) / np.radians(1.5), 0, 1)[:, None, None]
-    image += field * (ground - image)
-    return Sky(np.clip(image, 0, 1).astype(np.float32))
+    ridge = np.radians(1.2) * (1 + 0.8 * _periodic_noise(rng, 1, 24, 1) + 0.3 * _periodic_noise(rng, 1, 120, 1))
+    panorama = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
+    for first in range(0, HEIGHT, BLOCK):  # a block stays in the processor's cache
+        part = slice(first, first + BLOCK)
+        image = np.repeat(column[part, None, :], WIDTH, axis=1)
+        cover = np.clip((noise[part] - threshold) / 0.45, 0, 1) * np.clip((up[part, None] - 0.05) / 0.15, 0, 1)
+        image += 0.85 * cover[..., None] * (cloud * (1 - 0.12 * np.clip(noise[part], 0, 1)[..., None]) - image)
+        below = np.clip((np.maximum(ridge, np.radians(0.3)) - elevation[part, None]) / np.radians(0.25), 0, 1)
+        image += below[..., None] * (hills - image)
+        field = np.clip((np.radians(0.0) - elevation[part]) / np.radians(1.5), 0, 1)[:, None, None]
+        image += field * (ground - image)
+        np.clip(image, 0, 1, out=panorama[part], casting="same_kind")
+    return Sky(panorama)
 
 
-def _periodic_noise(rng: np.random.Generator, rows: int, columns: int) -> npt.NDArray[np.float64]:
-    """Return smooth noise ``(HEIGHT, WIDTH)`` of about unit spread whose left and right edges meet."""
+def _periodic_noise(rng: np.random.Generator, rows: int, columns: int, height: int = HEIGHT) -> npt.NDArray[np.float64]:
+    """Return the first ``height`` rows of smooth noise ``(HEIGHT, WIDTH)`` of about unit spread whose left and right edges meet."""
     small = rng.standard_normal((rows + 2, columns)).astype(np.float32)
     wide = np.concatenate([small[:, -2:], small, small[:, :3]], axis=1)
-    at_x = np.broadcast_to((np.arange(WIDTH, dtype=np.float32) * columns / WIDTH + 2)[None, :], (HEIGHT, WIDTH))
-    at_y = np.broadcast_to((np.arange(HEIGHT, dtype=np.float32) * rows / HEIGHT + 0.5)[:, None], (HEIGHT, WIDTH))
+    at_x = np.broadcast_to((np.arange(WIDTH, dtype=np.float32) * columns / WIDTH + 2)[None, :], (height, WIDTH))
+    at_y = np.broadcast_to((np.arange(height, dtype=np.float32) * rows / HEIGHT + 0.5)[:, None], (height, WIDTH))
     return np.asarray(cv2.remap(wide, np.ascontiguousarray(at_x), np.ascontiguousarray(at_y), cv2.INTER_CUBIC), dtype=np.float64)

@@ -37,7 +37,7 @@ STAGES = ("render", "references", "map", "fix", "policy", "control", "actors", "
 REFERENCE_SIDE = 768  # of the matrices of the reference work: 0.9 billion floating-point operations
 COMMANDS = {  # what a user waits for -> words of the command
     "start": ("--help",),
-    "one rollout": ("--renderer", "clean", "--policy", POLICY, "--workers", "1", "--no-report", "--out", "{run}", "smoke/curve"),
+    "one rollout": ("--renderer", "clean", "--policy", POLICY, "--out", "{run}", "smoke/curve"),
     "report": ("report", "{run}"),
 }
 
