@@ -17,10 +17,12 @@ from evaluators.report.fixers import fixer_cautions
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
 from evaluators.report.provenance import certificate_caution
 from evaluators.statistics.outcomes import outcome_table, sentence
+from evaluators.statistics.verdicts import holm
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
+LEVEL = 0.05  # of the primary question, and of all others together
 LEADING = 4  # arms named in the headline
 FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
 
@@ -96,8 +98,8 @@ def find(run: Run) -> Finding:
         (i, m): p for i, (_, pairs) in enumerate(compared) for m in _lead(run, pairs) if (p := finite(pairs[m].get("p_value"))) is not None
     }
     primary = declared(run, compared)
-    first = {key: p for key, p in asked.items() if key[1] == primary}  # one comparison: at the full level
-    shown = holm(first) | holm({key: p for key, p in asked.items() if key not in first})
+    families = [[key for key in asked if (key[1] == primary) == first] for first in (True, False)]  # one comparison: at the full level
+    shown = {key for keys in families for key, p in zip(keys, holm([asked[key] for key in keys]), strict=True) if (p or 0.0) <= LEVEL}
     points = tuple(
         _paired_point(run, variant, pairs, frozenset(m for j, m in asked if i == j and (j, m) not in shown), primary)
         for i, (variant, pairs) in enumerate(compared)
@@ -188,20 +190,6 @@ NO_PAIR = "no metric is valid in both members of any pair"
 def _listing(run: Run, metrics: Sequence[str]) -> str:
     words = [run.table.shown(m).words for m in metrics]
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
-
-
-def holm(p_values: Mapping[Any, float], alpha: float = 0.05) -> frozenset[Any]:
-    """Return which of several questions are answered when all share one alpha (Holm, Scandinavian Journal of Statistics 6, 1979).
-
-    >>> sorted(holm({"a": 0.01, "b": 0.02, "c": 0.2}))
-    ['a', 'b']
-    """
-    found: set[Any] = set()
-    for k, (name, p) in enumerate(sorted(p_values.items(), key=lambda one: one[1])):
-        if p > alpha / (len(p_values) - k):
-            break
-        found.add(name)
-    return frozenset(found)
 
 
 def _lead(run: Run, pairs: Mapping[str, Any]) -> list[str]:

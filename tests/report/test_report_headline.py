@@ -12,7 +12,7 @@ from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run, read_run
-from evaluators.report.headline import find, holm, tone_of
+from evaluators.report.headline import find, tone_of
 from evaluators.statistics.paired import paired
 from tests.evaluators.test_tables_over_rollouts import rows_of
 from tests.report.make_run import Plan, make_run
@@ -160,12 +160,6 @@ def test_finding_needs_nothing_but_the_folder(usual_run: Path, tmp_path: Path) -
     for name in ("run.json", "summary.json"):
         assert json.loads((usual_run / name).read_text())
     assert find(read_run(usual_run)) == find(read_run(usual_run))
-
-
-def test_one_small_p_value_among_many_questions_is_not_called_a_difference() -> None:
-    assert holm({"a": 0.04}) == {"a"}
-    assert holm({"a": 0.04, "b": 0.3, "c": 0.7}) == frozenset()
-    assert holm({"a": 0.01, "b": 0.02, "c": 0.03}) == {"a", "b", "c"}
 
 
 PRIMARY, SECOND = METRICS.primary, tuple(name for name in METRICS.rates if name != METRICS.primary)[:14]
