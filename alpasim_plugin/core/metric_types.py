@@ -23,6 +23,7 @@ class MetricInfo:
         is_flag: It is 0 or 1 per step; its mean over rollouts is a rate.
         derived: It exists per rollout only, computed in the reduction.
         is_headline: Reports lead with it.
+        is_primary: It is a run's one primary question, declared before a run by standing in its run.json; no other metric is.
         is_share: It is a fraction that is printed in percent; flags are anyway.
         name: Given by the mapping that holds the metric.
         label: What sentences and charts call it; empty: its name.
@@ -44,6 +45,7 @@ class MetricInfo:
     is_headline: bool = False
     is_share: bool = False
     _: KW_ONLY
+    is_primary: bool = False
     name: str = ""
     label: str = ""
     margin: float | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, fields, replace
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
@@ -63,13 +64,13 @@ class MetricTable(Mapping[str, MetricInfo]):
             'mean'
         """
         found = self.shown(name)
-        if not found.help and self._is_read:
+        if found.help:
+            return found
+        if self._is_read:
             do = "give a folder that simrun wrote, or score its logs again"
             raise InputError("reading a run folder", f"metric {name!r}", "run.json does not say what it is", do)
-        if not found.help:
-            do = "name it in the evaluator's `metrics`, or check the spelling"
-            raise EvaluatorError("looking up a metric", f"name {name!r}", "no evaluator declares it", do)
-        return found
+        do = "name it in the evaluator's `metrics`, or check the spelling"
+        raise EvaluatorError("looking up a metric", f"name {name!r}", "no evaluator declares it", do)
 
     def shown(self, name: str) -> MetricInfo:
         """Return a metric as `info` does, or one that has nothing but its name where the table does not hold it."""
@@ -82,6 +83,11 @@ class MetricTable(Mapping[str, MetricInfo]):
     def headline(self) -> tuple[str, ...]:
         """Give the metrics that a report leads with; the others are one click away."""
         return tuple(name for name, facts in self.items() if facts.is_headline)
+
+    @property
+    def primary(self) -> str:
+        """Give the metric that a run's one primary question is about; empty where it declared none, as earlier versions did."""
+        return next((name for name, facts in self.items() if facts.is_primary), "")
 
     @property
     def rates(self) -> frozenset[str]:
@@ -109,6 +115,8 @@ class MetricTable(Mapping[str, MetricInfo]):
             if self._metrics.get(name, replace(facts, name=name)) != replace(facts, name=name):
                 found = "it is declared already with other facts"
                 raise EvaluatorError("declaring a metric", f"name {name!r}", found, "choose another name")
+            if facts.is_primary and name != self.primary:
+                raise EvaluatorError("declaring a metric", f"name {name!r}", f"{self.primary!r} is primary", "leave is_primary out")
         return MetricTable({**self._metrics, **metrics})
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
@@ -158,10 +166,7 @@ def table_of(evaluators: Iterable[PartSpec]) -> MetricTable:
     Raises:
         EvaluatorError: Two declare one metric differently.
     """
-    table = METRICS
-    for spec in evaluators:
-        table = table.adding(spec.metrics)
-    return table
+    return reduce(lambda table, spec: table.adding(spec.metrics), evaluators, METRICS)
 
 
 def _flag(help_text: str, direction: Direction = "lower", aggregation: Aggregation = "max", **more: Any) -> MetricInfo:
@@ -219,8 +224,7 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
     ),
     "min_distance_to_obstacle_m": _metres(
         "least plan-view gap between the ego and any actor", "higher", "min", margin=0.25, curve=3, event="collision_any",
-        reference=FOOTPRINT,
-        formula="least distance from `F` to any actor's rectangle, 0 on touch", invalid="steps with no other actor",
+        reference=FOOTPRINT, formula="least distance from `F` to any actor's rectangle, 0 on touch", invalid="steps with no other actor",
     ),
     "contact_time_s": MetricInfo(
         "s", "none", "min", "when the first contact begins, counted from the first ego pose of the log", limits=(0.0, None),
@@ -341,9 +345,7 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
         "", "higher", "last", "progress; in later AlpaSim of what the recording reaches by then", reference=CENTRE,
         formula="as `progress`; `alpasim` only", invalid="`P` has no length",
     ),
-    "dist_traveled_m": _metres(
-        "metres driven", "none", "last", reference=CENTRE, formula="length driven since the policy took control",
-    ),
+    "dist_traveled_m": _metres("metres driven", "none", "last", reference=CENTRE, formula="length driven since the policy took control"),
     "gt_dist_traveled_m": _metres("length of the recorded path", "none", "last", reference=CENTRE, formula="length of `P`"),
     "plan_deviation": _metres(
         "how far consecutive plans differ at common times, near ones weigh more", "lower", "mean", margin=0.05, curve=4, reference=CENTRE,
@@ -367,14 +369,14 @@ METRICS = MetricTable({  # in the order in which reports show them, after the he
     ),
     "safety_monitor_triggered": _flag("the policy's own safety monitor fired", direction="none", formula="0; `alpasim` only"),
     "eval_relevant": _flag(
-        "the policy drives: the warm-up is over", direction="none",
-        formula="1 from `render_start + force_gt` on: the warm-up with the forced recording is over",
+        "the policy drives: the warm-up is over", "none", formula="1 from `render_start + force_gt` on: the forced recording is over",
     ),
     "offroad_or_collision": _flag(
         "off-road or any contact", derived=True, reference=FOOTPRINT, formula="`offroad` or `collision_any`", invalid=_EITHER,
     ),
     "offroad_or_collision_at_fault": _flag(
-        "off-road or contact at fault", derived=True, reference=FOOTPRINT, formula="`offroad` or `collision_at_fault`", invalid=_EITHER,
+        "off-road or contact at fault", derived=True, is_headline=True, is_primary=True, label="off-road or at-fault rollouts",
+        reference=FOOTPRINT, formula="`offroad` or `collision_at_fault`", invalid=_EITHER,
     ),
     "duration_frac_20s": MetricInfo("", "none", "last", "scored time over 20 s", derived=True),
     "scene_score": MetricInfo("", "higher", "last", "AlpaSim's score: 0 after a fault, else saturated progress", derived=True),

@@ -1,7 +1,8 @@
 """Summarise a run in one sentence, from the numbers of ``summary.json`` alone.
 
 The verdict words come from the paired comparison; this module never tests anything itself, so that the sentence and the table
-below it cannot disagree.
+below it cannot disagree. The sentence answers the one question that the run declared before it was driven (`MetricTable.primary`); what
+else is found stands behind it as secondary.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from evaluators.report.fixers import fixer_cautions
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
 from evaluators.report.provenance import certificate_caution
 from evaluators.statistics.outcomes import outcome_table, sentence
+from evaluators.statistics.verdicts import holm
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
+LEVEL = 0.05  # of the primary question, and of all others together
 LEADING = 4  # arms named in the headline
 FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
 
@@ -32,7 +35,8 @@ class Point:
         name: What sentences call it.
         tone: Of its differences.
         text: What they are.
-        worse, better: Metrics that are.
+        worse, better: Metrics that the headline names as that.
+        asked: Metrics that the headline is about; empty: all that are compared.
         baseline: What it is compared with; empty where with nothing.
         lead: The one difference that says most, with its interval.
         variant: Its key in ``summary.json``.
@@ -43,6 +47,7 @@ class Point:
     text: str
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
+    asked: tuple[str, ...] = ()
     baseline: str = ""
     lead: str = ""
     variant: str = ""
@@ -90,26 +95,38 @@ def find(run: Run) -> Finding:
         return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run), ended)
     compared = list(pair_tables(run.summary))
     asked = {
-        (i, m): float(p)
-        for i, (_, pairs) in enumerate(compared)
-        for m in _lead(run, pairs)
-        if (p := finite(pairs[m].get("p_value"))) is not None
+        (i, m): p for i, (_, pairs) in enumerate(compared) for m in _lead(run, pairs) if (p := finite(pairs[m].get("p_value"))) is not None
     }
-    shown = holm(asked)
+    primary = declared(run, compared)
+    families = [[key for key in asked if (key[1] == primary) == first] for first in (True, False)]  # one comparison: at the full level
+    shown = {key for keys in families for key, p in zip(keys, holm([asked[key] for key in keys]), strict=True) if (p or 0.0) <= LEVEL}
     points = tuple(
-        _paired_point(run, variant, pairs, frozenset(m for j, m in asked if i == j and (j, m) not in shown))
+        _paired_point(run, variant, pairs, frozenset(m for j, m in asked if i == j and (j, m) not in shown), primary)
         for i, (variant, pairs) in enumerate(compared)
     )
+    cautions = _cautions(run)
+    if compared and run.table.primary and not primary:
+        text = f"Not every comparison has a value of the primary question, {run.table.shown(run.table.primary).words}"
+        cautions += (f"{text}: the headline is about all questions, corrected together.",)
     if points:
         title = "; ".join(_clause(run, point) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
         tones = {point.tone for point in points}
         order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
         tone = next(t for t in order if t in tones)
-        return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, _cautions(run), ended)
+        return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, cautions, ended)
     title = f"{ended[0][0]}: {ended[0][1]}" if len(ended) == 1 else f"{plural(len(ended), 'arm')} driven, none of which can be paired"
     alone = tuple(Point(arm_label(run, name), "neutral", _alone(run, name), variant=name) for name in run.variants)
-    return Finding(title, "neutral", alone, _cautions(run), ended)
+    return Finding(title, "neutral", alone, cautions, ended)
+
+
+def declared(run: Run, compared: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
+    """Return the metric of the run's primary question; empty where it declared none, or not every comparison has a value of it.
+
+    Then the headline is about all questions, corrected together: which one answers it may not depend on what was found.
+    """
+    primary = run.table.primary
+    return primary if all(primary in _lead(run, pairs) for _, pairs in compared) else ""
 
 
 def endings(run: Run) -> tuple[tuple[str, str], ...]:
@@ -159,10 +176,12 @@ def _clause(run: Run, point: Point) -> str:
     if point.tone == "mixed":
         return f"{point.name} is worse than {baseline} in {_listing(run, point.worse)} and better in {_listing(run, point.better)}"
     if point.tone == "neutral":
-        return f"{point.name} drives no worse than {baseline} by more than the margins"
+        where = f"in {_listing(run, point.asked)} by more than the margin" if point.asked else "by more than the margins"
+        return f"{point.name} drives no worse than {baseline} {where}"
     if point.text == NO_PAIR:
         return f"nothing to compare between {point.name} and {baseline}"
-    return f"no difference shown between {point.name} and {baseline}"
+    where = f" in {_listing(run, point.asked)}" if point.asked else ""
+    return f"no difference shown between {point.name} and {baseline}{where}"
 
 
 NO_PAIR = "no metric is valid in both members of any pair"
@@ -173,56 +192,55 @@ def _listing(run: Run, metrics: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
-def holm(p_values: Mapping[Any, float], alpha: float = 0.05) -> frozenset[Any]:
-    """Return which of several questions are answered when all share one alpha (Holm, Scandinavian Journal of Statistics 6, 1979).
-
-    >>> sorted(holm({"a": 0.01, "b": 0.02, "c": 0.2}))
-    ['a', 'b']
-    """
-    found: set[Any] = set()
-    for k, (name, p) in enumerate(sorted(p_values.items(), key=lambda one: one[1])):
-        if p > alpha / (len(p_values) - k):
-            break
-        found.add(name)
-    return frozenset(found)
-
-
 def _lead(run: Run, pairs: Mapping[str, Any]) -> list[str]:
-    """Return the differences that the headline asks for."""
+    """Return the differences that a head of a report asks for."""
     lead = [m for m in run.table.headline if m in pairs and finite(pairs[m].get("diff")) is not None]
     if "collision_at_fault" in lead and "collision_any" in lead:
         lead.remove("collision_any")
     return lead or [m for m in run.table.ordered(pairs) if finite(pairs[m].get("diff")) is not None]
 
 
-def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any], chance: frozenset[str]) -> Point:
+def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any], chance: frozenset[str], primary: str) -> Point:
     """Describe one comparison; what may be chance among so many questions is called undecided."""
     stats = run.summary.get("metrics", {}).get(variant, {})
     lead = _lead(run, pairs)
     tones = {m: tone_of(pairs[m], str(stats.get(m, {}).get("direction", "none"))) for m in lead}
     tones = {m: "unclear" if m in chance and tone in ("worse", "better") else tone for m, tone in tones.items()}
-    said = [m for m in lead if tones[m] in ("worse", "better")]
-    kinds = {tones[m] for m in said}
+    asked = (primary,) if primary else ()
+    named = asked or lead
+    kinds = {tones[m] for m in named if tones[m] in ("worse", "better")}
     tone: Tone = "mixed" if len(kinds) == 2 else next(iter(kinds)) if kinds else "unclear"
-    if not said and lead and all(t == "neutral" for t in tones.values()):
+    if not kinds and named and all(tones[m] == "neutral" for m in named):
         tone = "neutral"
-    moved = [*said, *(m for m in lead if m not in said and m != "progress" and finite(pairs[m].get("diff")) != 0.0)]
-    same = [m for m in lead if m not in moved and m != "progress"]
-    parts = [_difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
-    parts += [_nothing_seen(run, variant, m, pairs[m]) for m in same]
-    text = "; ".join(parts)
-    text = text or NO_PAIR
-    worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
+    said = [m for m in lead if tones[m] in ("worse", "better")]
+    others = [m for m in lead if m not in named]
+
+    def described(names: Sequence[str]) -> str:
+        moved = [m for m in names if m in said or (m != "progress" and finite(pairs[m].get("diff")) != 0.0)]
+        parts = [
+            _difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear" and m != primary)
+            for m in sorted(moved, key=lambda m: m not in said)
+        ]
+        return "; ".join(parts + [_nothing_seen(run, variant, m, pairs[m]) for m in names if m not in moved and m != "progress"])
+
+    worse, better = ([m for m in said if tones[m] == kind] for kind in ("worse", "better"))
     baseline = str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
+    text, lines = described(named), {m: _difference(run, variant, m, pairs[m], brief=False) for m in lead}
+    if primary:
+        ways = ((kind, [m for m in of if m != primary]) for kind, of in (("worse", worse), ("better", better)))
+        found = [f"{kind} in {_listing(run, of)}" for kind, of in ways if of]
+        second = f". Secondary: {' and '.join(found)}" if found else ""
+        first, rest = lines[primary] + second, described(others)
+        text += (second or ". Secondary") + (f": {rest}" if rest else "") if rest or found else ""
+    else:
+        # The first difference that is shown says most; where none is, the one that is largest against its margin.
+        def against_margin(m: str) -> float:
+            return abs(float(pairs[m]["diff"])) / max(finite(pairs[m].get("margin")) or 0.0, 1e-3)
 
-    def against_margin(m: str) -> float:
-        return abs(float(pairs[m]["diff"])) / max(finite(pairs[m].get("margin")) or 0.0, 1e-3)
-
-    # The first difference that is shown says most; where none is, the one that is largest against its margin.
-    shown = [m for m in lead if pairs[m].get("difference") in ("better", "worse")]
-    most = next(iter(shown), max(lead, key=against_margin, default=None))
-    first = "" if most is None else _difference(run, variant, most, pairs[most], brief=False)
-    return Point(arm_label(run, variant), tone, text, worse, better, arm_label(run, baseline), first, variant)
+        shown = [m for m in lead if pairs[m].get("difference") in ("better", "worse")]
+        first = lines.get(next(iter(shown), max(lead, key=against_margin, default="")), "")
+    worse_here, better_here = (tuple(m for m in of if m in named) for of in (worse, better))
+    return Point(arm_label(run, variant), tone, text or NO_PAIR, worse_here, better_here, asked, arm_label(run, baseline), first, variant)
 
 
 def _nothing_seen(run: Run, variant: str, metric: str, entry: Mapping[str, Any]) -> str:
@@ -306,7 +324,7 @@ def _level(run: Run, variant: str, metric: str) -> str:
 
 def _alone(run: Run, variant: str) -> str:
     stats = run.summary.get("metrics", {}).get(variant, {})
-    names = [m for m in run.table.headline if m in stats and m != "progress"]
+    names = [m for m in run.table.headline if m in stats and m not in ("progress", run.table.primary)]
     if "collision_at_fault" in names and "collision_any" in names:
         names.remove("collision_at_fault")
     return "; ".join(f"{run.table.shown(m).words}: {_level(run, variant, m)}" for m in names) or "no metric"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -148,6 +148,24 @@ def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
         return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
     t = float(np.mean(means) / (np.std(means, ddof=1) / np.sqrt(len(means))))
     return 2.0 * float(scipy.special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Return p-values corrected for their number by Holm's step-down method; what is None is no test and stays so.
+
+    Source: Holm, Scandinavian Journal of Statistics 6 (1979).
+
+    Example:
+        >>> holm([0.01, None, 0.04, 0.03])
+        [0.03, None, 0.06, 0.06]
+    """
+    tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    out: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for rank, (p, i) in enumerate(tested):
+        largest = max(largest, min((len(tested) - rank) * p, 1.0))
+        out[i] = largest
+    return out
 
 
 POWER = 0.8

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from evaluators import paired
-from evaluators.statistics.verdicts import difference, verdict
+from evaluators.statistics.verdicts import difference, holm, verdict
 from tests.evaluators.test_tables_over_rollouts import rows_of
 
 
@@ -187,3 +187,8 @@ def test_a_metric_of_which_nothing_says_how_much_a_scene_can_differ_decides_noth
     found = pair(base, other, "contact_x_m")
     assert (found["verdict"], found["guarded"]) == ("undecided", None)
     assert "nothing says how much a scene can differ" in found["note"]
+
+
+def test_the_correction_is_holms() -> None:
+    assert holm([0.01, None, 0.04, 0.03]) == pytest.approx([0.03, None, 0.06, 0.06])
+    assert holm([None]) == [None]

@@ -28,6 +28,7 @@ METRICS = (
     "collision_lateral",
     "collision_rear",
     "offroad",
+    "offroad_or_collision_at_fault",
     "lateral_distance_m",
     "progress",
     "dist_to_gt_location",
@@ -209,6 +210,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "collision_any": hit.astype(float),
         "collision_at_fault": hit.astype(float),
         "offroad": off.astype(float),
+        "offroad_or_collision_at_fault": (hit | off).astype(float),
     }
     steps = [
         key | {"t_us": k * DT_US, "metric": m, "value": float(v[k]), "valid": True, "reason": ""}
@@ -223,6 +225,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "collision_lateral": float(collided),
         "collision_rear": 0.0,
         "offroad": float(off[:end].any()),
+        "offroad_or_collision_at_fault": float(collided or off[:end].any()),
         "lateral_distance_m": float(np.abs(offset[:end]).mean()),
         "progress": end / plan.steps,
         "dist_to_gt_location": float(np.abs(offset[:end]).mean() + 0.4),

@@ -174,8 +174,8 @@ def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> No
 
 def test_terminal_table_can_be_short(usual_run: Path) -> None:
     summary = json.loads((usual_run / "summary.json").read_text())
-    assert render_table(summary, headline_only=True).row_count == 5
-    assert render_table(summary).row_count == 13
+    assert render_table(summary, headline_only=True).row_count == 6
+    assert render_table(summary).row_count == 14
     nothing = render_table({"metrics": {}}, headline_only=True)
     assert (nothing.row_count, nothing.caption) == (0, None)
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
@@ -80,7 +79,6 @@ def plot(rows: Sequence[Row], path: str | Path) -> None:
     """Draw all-in time per frame against both errors, one point a setting, and write a PNG."""
     sizes = list(dict.fromkeys(row.size for row in rows))
     figure = Figure(figsize=(14, 6.2 * len(sizes)), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(sizes), 2, squeeze=False)
     titles = {"rounding": "rounding: the same setting", "model": "model: the base with a window over the whole clip"}
     for line, size in zip(axes, sizes, strict=True):

@@ -7,7 +7,7 @@ resumes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,7 @@ from alpasim_plugin.lab.paper.document import EqualTime, Findings
 from alpasim_plugin.lab.paper.measured import Measured, from_rows
 from alpasim_plugin.lab.paper.page import ShownClip
 from alpasim_plugin.lab.paper.position import windows
-from alpasim_plugin.lab.paper.regime import TRAINED_ON_CLEAN, TRAINED_ON_OWN, RegimeClip, as_measured
-from alpasim_plugin.lab.paper.training import TrainedArm
+from alpasim_plugin.lab.paper.regime import TRAINED_ON_CLEAN, TRAINED_ON_OWN, as_measured
 from alpasim_plugin.lab.paper.wrong_map import Shift
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
@@ -105,35 +104,6 @@ class PaperRun:
     other_seeds: tuple[Path, ...] = ()
 
 
-@dataclass
-class Compared:
-    """What was measured.
-
-    Args:
-        measured: PROTOCOL -> values and features by arm.
-        works: PROTOCOL -> its works.
-        shown: Clips of the page.
-        units: ARM -> what it makes at a time and what that costs; None for the render.
-        shifted: The protocol ``map-error`` by configuration, where ``measured`` has groups of them.
-        memory: Peak memory of a training sample by clip length and horizon.
-        cost: Quality against training time; None where it was not asked for.
-        regime: Clips of the regime map.
-        training: How the arms were trained, as far as their folder says.
-        equal_time: The arms of equal core-minutes; None where they were not asked for.
-    """
-
-    measured: dict[str, Measured] = field(default_factory=dict)
-    works: dict[str, list[Work]] = field(default_factory=dict)
-    shown: list[ShownClip] = field(default_factory=list)
-    units: dict[str, dict[str, Any] | None] = field(default_factory=dict)
-    shifted: Measured | None = None
-    memory: list[MemoryCell] = field(default_factory=list)
-    cost: Cost | None = None
-    regime: list[RegimeClip] = field(default_factory=list)
-    training: tuple[TrainedArm, ...] = ()
-    equal_time: EqualTime | None = None
-
-
 def arms_in(folder: Path, option: str = "--arms", steps_of: Mapping[str, tuple[int | None, ...]] = STEPS) -> tuple[Variant, ...]:
     """Return the arms that were trained: a variant for each number of steps that the paper reports, in alphabetical order.
 
@@ -162,7 +132,7 @@ def arms_in(folder: Path, option: str = "--arms", steps_of: Mapping[str, tuple[i
     return tuple(found)
 
 
-def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str], None]) -> Compared:
+def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str], None]) -> Findings:
     """Measure every arm under every protocol that is asked for.
 
     Args:
@@ -173,7 +143,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     Raises:
         InputError: No clip for a protocol.
     """
-    out = Compared()
+    out = Findings()
     arms = (Variant(RAW), *(Variant(name, resolve("fixer", name, ())) for name in SHIPPED), *arms_in(run.arms))
     plain = tuple(arm for arm in arms if arm.label == OURS)
     arms = tuple(arm for arm in arms if arm.label != APPEARANCE)  # it has a protocol of its own
@@ -184,20 +154,21 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     for name in TWICE:
         if name in run.protocols:
             sequences = _sequences(run, name)
-            _open_loop(run, name, sequences, arms, frozenset(s.name for s in evenly(sequences, run.filmed)), told, out)
+            works = _open_loop(run, name, sequences, arms, frozenset(s.name for s in evenly(sequences, run.filmed)), told, out)
+            out.shown = shown_clips(works) if name == "cycle" else out.shown
     if (found := out.measured.get("under-trained")) is not None:
-        frames = min(int(row_of(work)["frames"]) for work in out.works["under-trained"])
+        frames = min(int(row["frames"]) for row in out.rows["under-trained"])
         out.measured |= dict(zip(WINDOWS, windows(found, frames), strict=False))
-    if "cycle" in run.protocols:
-        out.shown = shown_clips(out.works["cycle"])
     if "map-error" in run.protocols:
-        shown = _shifted(arms, run.arms)
+        shown = _wrong_maps(arms, run.arms)
         _open_loop(run, "map-error", evenly(_sequences(run, "cycle"), run.map_clips), shown, frozenset(), told, out)
-        out.shifted = out.measured["map-error"]
-        out.measured["map-error"] = grouped(out.shifted)
+        out.shifted = shifted(out.measured["map-error"])
+        out.measured["map-error"] = grouped(out.shifted[0])
     out.measured |= driven
     if "memory" in run.protocols:
-        out.memory = training_memory(run.out / "memory.json")
+        cells = training_memory(run.out / "memory.json")
+        rises = "It rises with both, as in the paper" if monotone(cells) else "It does not rise with both everywhere; in the paper it does"
+        out.memory = f"{MEMORY}\n{memory_table(cells)}\n\n{rises} (within 10 %, the allocator's).\n"
     if "cost" in run.protocols:
         curves, snapshots = cost_curves((run.arms, *run.other_seeds))
         clips, frames, about = cost_clips(run.pairs, run.clips, run.frames)
@@ -231,9 +202,9 @@ def _by_history(run: PaperRun) -> tuple[Variant, ...]:
     return tuple(found)
 
 
-def _equal_time(run: PaperRun, folder: Path, found: Sequence[Variant], told: Told, out: Compared) -> EqualTime:
+def _equal_time(run: PaperRun, folder: Path, found: Sequence[Variant], told: Told, out: Findings) -> EqualTime:
     """Measure the arms of equal core-minutes on the clips of the others; the others' values are those measured there."""
-    arms, second = tuple(arm for arm in found if arm.label != APPEARANCE), Compared()
+    arms, second = tuple(arm for arm in found if arm.label != APPEARANCE), Findings()
     taken = within_budget([one for one in out.training if one.arm != APPEARANCE], folder)
     same = {RAW, *SHIPPED, *(one.arm for one in taken)}
     merged: dict[str, Measured] = {}
@@ -249,22 +220,9 @@ def _equal_time(run: PaperRun, folder: Path, found: Sequence[Variant], told: Tol
     return EqualTime(merged, (*trained_arms(folder), *taken), tuple(one.arm for one in taken))
 
 
-def findings(compared: Compared) -> Findings:
-    """Return what the document is made of."""
-    shifts = {arm: shift for arm in (compared.shifted.arms if compared.shifted else ()) if (shift := _shift_of(arm)) is not None}
-    cells = compared.memory
-    rises = "It rises with both, as in the paper" if monotone(cells) else "It does not rise with both everywhere; in the paper it does"
-    return Findings(
-        compared.measured,
-        {name: [row_of(work) for work in works] for name, works in compared.works.items()},
-        compared.units,
-        None if compared.shifted is None else (compared.shifted, shifts),
-        f"{MEMORY}\n{memory_table(cells)}\n\n{rises} (within 10 %, the allocator's).\n" if cells else "",
-        compared.cost,
-        compared.training,
-        compared.equal_time,
-        compared.regime,
-    )
+def shifted(measured: Measured) -> tuple[Measured, dict[str, Shift]]:
+    """Return measurements with an arm for each configuration of a wrong map, and how far each is off."""
+    return measured, {arm: shift for arm in measured.arms if (shift := _shift_of(arm)) is not None}
 
 
 def _shift_of(arm: str) -> Shift | None:
@@ -312,8 +270,9 @@ def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:
 
 
 def _open_loop(
-    run: PaperRun, name: str, sequences: Sequence[PairSequence], arms: Sequence[Variant], filmed: frozenset[str], told: Told, out: Compared
-) -> None:
+    run: PaperRun, name: str, sequences: Sequence[PairSequence], arms: Sequence[Variant], filmed: frozenset[str], told: Told, out: Findings
+) -> list[Work]:
+    """Measure arms under a protocol and add it to what was found; return the works."""
     measuring = QualityRun(
         sequences, arms, run.out / name, frames=run.frames or PAPER_LENGTH[name], seed=run.seed, jobs=run.jobs, filmed=filmed,
         judging=run.judging, scenes=run.scenes,
@@ -321,8 +280,9 @@ def _open_loop(
     works = measuring.works()
     for i, (work, row) in enumerate(measuring.finished(works), start=1):
         told(name, i, len(works), work, row)
-    out.works[name] = works
-    out.measured[name] = Measured(from_rows([row_of(work) for work in works]), _features(works) if run.judging else None, TRUTH, run.seed)
+    out.rows[name] = [row_of(work) for work in works]
+    out.measured[name] = Measured(from_rows(out.rows[name]), _features(works) if run.judging else None, TRUTH, run.seed)
+    return works
 
 
 def _features(works: Iterable[Work]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -334,7 +294,7 @@ def _features(works: Iterable[Work]) -> dict[str, dict[str, dict[str, Any]]]:
     return out
 
 
-def _shifted(arms: Sequence[Variant], folder: Path) -> tuple[Variant, ...]:
+def _wrong_maps(arms: Sequence[Variant], folder: Path) -> tuple[Variant, ...]:
     """Return our method under all wrong maps, and the lines to stay above: itself and V5 with a black map, and an arm without a map."""
     by_name = {arm.label: arm for arm in arms}
     ours = by_name.get(OURS) or by_name[SHIPPED[0]]

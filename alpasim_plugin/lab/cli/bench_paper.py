@@ -14,7 +14,7 @@ from rich.console import Console
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_json, write_text
 from alpasim_plugin.lab.bench.judged import Judging
-from alpasim_plugin.lab.bench.paper import DOING, PaperRun, compare_arms, findings
+from alpasim_plugin.lab.bench.paper import DOING, PaperRun, compare_arms
 from alpasim_plugin.lab.bench.quality_run import Work
 from alpasim_plugin.lab.bench.transfer import TransferData
 from alpasim_plugin.lab.cli.training_options import whole_numbers
@@ -126,19 +126,18 @@ def paper(
         if not as_json:
             console.print(f"clip {i}/{n} {name}")
 
-    found = compare_arms(run, told, told_clip)
-    made = replace(findings(found), recorded=earlier)
+    found = replace(compare_arms(run, told, told_clip), recorded=earlier)
     command = command_line()
-    write_text(out / "paper.md", document(published(), made, command))
-    write_text(out / "claims.md", f"```bash\n{command}\n```\n\n{claims_document(made)}")
-    draw_figures(made, out)
+    write_text(out / "paper.md", document(published(), found, command))
+    write_text(out / "claims.md", f"```bash\n{command}\n```\n\n{claims_document(found)}")
+    draw_figures(found, out)
     if found.cost is not None:
         console.print(f"cost: {found.cost.about}", highlight=False)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
-    verdicts = [{"claim": one.claim.text, "verdict": one.verdict, "comparisons": [asdict(r) for r in one.results]} for one in made.judged]
+    verdicts = [{"claim": one.claim.text, "verdict": one.verdict, "comparisons": [asdict(r) for r in one.results]} for one in found.judged]
     kept = record_of(found.measured, {name: measured.arms for name, measured in found.measured.items()})
     write_json(out / "paper.json", {**facts, "claims": verdicts, "protocols": kept})
     if found.shown:
-        first = made.rows["cycle"][0]["size"]
+        first = found.rows["cycle"][0]["size"]
         write_text(out / "side-by-side.html", render_side_by_side(found.shown, (int(first[0]), int(first[1]))))
     print(json.dumps(verdicts) if as_json else f"wrote {out / 'paper.md'}")

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from alpasim_plugin.lab.paper.claims import ALL, MOTION, MS, OURS, PERCEPTUAL, RAW
 from alpasim_plugin.lab.paper.verdict import Evidence
+from alpasim_plugin.lab.video_metrics.charts import DPI
 
 SHOWN = (RAW, *ALL, "omnidreams@1", "artifixer-pre@4", "artifixer-pre@1", OURS, "onefixer-dit-tiny", "onefixer")
 PATHS = (("omnidreams@4", "omnidreams@1"), ("artifixer-pre@4", "artifixer-pre@1"), ("artifixer-pre@1", "artifixer"))
-AREA, RENDER_AREA, DPI = 12.0, 30.0, 110  # points squared a millisecond; of what takes none
+AREA, RENDER_AREA = 12.0, 30.0  # points squared a millisecond; of what takes none
 
 
 def plot_bubbles(measured: Evidence, path: Path) -> None:
     """Draw the arms that were measured and write a PNG; dashed: the same arm with fewer steps, or distilled."""
     figure = Figure(figsize=(9.6, 6.6), layout="constrained")
-    FigureCanvasAgg(figure)
     ax = figure.subplots()
     at = {}
     for arm in dict.fromkeys(SHOWN):

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from alpasim_plugin.lab.paper.claims import behind
 from alpasim_plugin.lab.paper.measured import Difference, Measured
 from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.tables import markdown_table, paper_against_ours
+from alpasim_plugin.lab.video_metrics.charts import DPI, finish
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.run_folder.sides import Row, by_renderer
 from evaluators.report.ci import cell_text, metric_label
@@ -38,7 +38,6 @@ FLIPS = f"""Flips: scenes and seeds with the event behind one of the two rendere
 events than behind `{BASELINE}` with how many have fewer; the test on rollouts (McNemar) takes them as independent.
 """
 PANELS = {"offroad_or_collision_at_fault": 100.0, "route_distance_m": 1.0, "progress": 100.0}  # of the figure, and their scales
-DPI = 110
 FLIP_HEAD = (
     "renderer", "event", "only behind it", f"only behind {BASELINE}", "p, rollouts", "scenes with more", "scenes with fewer", "p, scenes",
 )  # fmt: skip
@@ -119,7 +118,6 @@ def plot_closed_loop(drives: Sequence[Driven], path: Path) -> None:
     """Draw event rate, route distance and progress by renderer, a row of panels for each policy, and write a PNG."""
     most = max(len(driven.arms) for driven in drives)
     figure = Figure(figsize=(10.4, (0.28 * most + 0.9) * len(drives) + 0.3), layout="constrained")
-    FigureCanvasAgg(figure)
     for driven, row in zip(drives, figure.subplots(len(drives), len(PANELS), squeeze=False), strict=True):
         for ax, (metric, scale) in zip(row, PANELS.items(), strict=True):
             _panel(ax, driven, metric, scale)
@@ -144,9 +142,7 @@ def _panel(ax: Axes, driven: Driven, metric: str, scale: float) -> None:
     ax.set_yticks(range(len(driven.arms)), [""] * len(driven.arms))
     ax.set_ylim(len(driven.arms) - 0.5, -0.5)
     ax.set_xlabel(f"{metric}, %" if scale == 100.0 else metric)
-    ax.set_title(f"{KNOWN.info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
-    ax.grid(visible=True, axis="x", alpha=0.25)
-    ax.spines[["top", "right"]].set_visible(False)
+    finish(ax, metric, axis="x")
 
 
 def _of_policy(published: Published, driven: Driven) -> str:

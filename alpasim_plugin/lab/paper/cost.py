@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from typing import Any
 
 from alpasim_plugin.lab.learned_metrics.facts import FD_16, FVMD_LK
 from alpasim_plugin.lab.paper.claims import CLAIMS, OURS, within
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.tables import ARROWS, SET_DIGITS, difference_text, markdown_table
 from alpasim_plugin.lab.paper.verdict import contest_results
+from alpasim_plugin.lab.video_metrics.charts import DPI, finish, legend, panels_of
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.lab.video_metrics.table import DIGITS
 
 METRICS = (FD_16, FVMD_LK, "psnr_db", "perceptual-syn")
-COLUMNS, DPI = 2, 110
 COLOURS = {OURS: "C3", "self-forcing": "C0", "one-forcing": "C2"}
 HOW = """Core-minutes are processor time of the updates alone, all stages of an arm in turn, a shared one counted for each; the initial
 networks and the evaluation do not count. A distilled arm's teacher is no causal network: its time counts, and the arm's curve begins with
@@ -182,28 +180,19 @@ def _value(measured: Measured, label: str, metric: str) -> str:
 def plot_cost(cost: Cost, path: Path) -> None:
     """Draw every metric against core-minutes and write a PNG; dashed lines are the ends of stages before the last."""
     curves, measured, shown = cost.curves, cost.measured, cost.metrics
-    rows = -(-len(shown) // COLUMNS)
-    figure = Figure(figsize=(5.2 * COLUMNS, 3.1 * rows + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
-    for ax in panels[len(shown) :]:
-        ax.set_visible(False)
+    figure, panels = panels_of(len(shown))
     for ax, metric in zip(panels, shown, strict=False):
         for i, curve in enumerate(curves):
             colour = COLOURS.get(curve.arm, f"C{i + 4}")
             x = [point.core_minutes for point in curve.points if measured.has(point.label, metric)]
             y = [measured.mean(point.label, metric).centre for point in curve.points if measured.has(point.label, metric)]
             first = curve.seed == cost.seeds[0]
-            how = {"marker": "o", "linewidth": 1.6} if first else {"marker": "s", "linewidth": 1.0, "alpha": 0.55}
+            how: Any = {"marker": "o", "linewidth": 1.6} if first else {"marker": "s", "linewidth": 1.0, "alpha": 0.55}
             ax.plot(x, y, markersize=3.5, color=colour, label=cost.name(curve), **how)
             for end in list(curve.ends.values())[:-1] if first else ():
                 ax.axvline(end, color=colour, linestyle="--", linewidth=0.9, alpha=0.5)
         ax.set_xlim(left=0)
         ax.set_xlabel("core-minutes")
-        ax.set_ylabel("PSNR, dB" if metric == "psnr_db" else metric)
-        ax.set_title(f"{KNOWN.info(metric).direction} is better; dashed: a stage ends", fontsize=8, loc="right", color="0.4")
-        ax.grid(visible=True, alpha=0.25)
-        ax.spines[["top", "right"]].set_visible(False)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=max(len(curves), 1), fontsize=9, frameon=False)
+        finish(ax, metric, "; dashed: a stage ends")
+    legend(figure, panels[:1], len(curves))
     figure.savefig(path, dpi=DPI)

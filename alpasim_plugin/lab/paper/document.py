@@ -14,10 +14,11 @@ from alpasim_plugin.lab.paper.claims import MARGINS, OURS
 from alpasim_plugin.lab.paper.closed_loop import Driven, closed_loop_section, plot_closed_loop
 from alpasim_plugin.lab.paper.cost import Cost, cost_section, plot_cost
 from alpasim_plugin.lab.paper.measured import Measured
-from alpasim_plugin.lab.paper.position import DRAWN, DRIFTING, by_position, distance_by_position, drift, with_half
+from alpasim_plugin.lab.paper.page import ShownClip
+from alpasim_plugin.lab.paper.position import DRAWN, DRIFTING, by_position, distance_by_position, drift
 from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.regime import RegimeClip, plot_regime, regime_section
-from alpasim_plugin.lab.paper.tables import differences, markdown_table, paper_against_ours, verdicts
+from alpasim_plugin.lab.paper.tables import differences, markdown_table, paper_against_ours, verdicts, with_half
 from alpasim_plugin.lab.paper.training import WITHIN, TrainedArm, training_section
 from alpasim_plugin.lab.paper.transfer import transfer_section
 from alpasim_plugin.lab.paper.verdict import Evidence, Judged, in_both, judge_claims
@@ -59,13 +60,14 @@ both.
 """
 
 
-@dataclass(frozen=True)
+@dataclass
 class Findings:
-    """What a comparison found.
+    """What a comparison found, as far as it is done.
 
     Args:
         measured: PROTOCOL -> what was measured; one that was not run is not there. ``map-error`` holds groups of configurations.
         rows: PROTOCOL -> rows of clips, for quality by frame.
+        shown: Filmed clips.
         units: ARM -> ``frames``, ``lookahead_frames`` and ``calls_per_frame`` of what it makes at a time.
         shifted: ``map-error`` with an arm for each configuration, and how far each is off.
         memory: Table of the peak memory of a training sample; empty where it was not measured.
@@ -76,9 +78,10 @@ class Findings:
         recorded: PROTOCOL -> what an earlier comparison left, by which claims are judged that nothing here judges.
     """
 
-    measured: Mapping[str, Measured]
-    rows: Mapping[str, Sequence[Mapping[str, Any]]]
-    units: Mapping[str, Mapping[str, Any] | None]
+    measured: dict[str, Measured] = field(default_factory=dict)
+    rows: dict[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
+    units: Mapping[str, Mapping[str, Any] | None] = field(default_factory=dict)
+    shown: Sequence[ShownClip] = ()
     shifted: tuple[Measured, Mapping[str, wrong_map.Shift]] | None = None
     memory: str = ""
     cost: Cost | None = None
@@ -243,6 +246,6 @@ def _times(measured: Measured, units: Mapping[str, Mapping[str, Any] | None]) ->
         found = measured.mean(arm, "ms_per_frame")
         first = unit["lookahead_frames"] * PERIOD_MS + unit["frames"] * found.centre
         calls = f"{unit['calls_per_frame']:.3g}"
-        rows.append([arm, with_half(found.centre, found.low, found.high, 1), calls, str(unit["lookahead_frames"]), f"{first:.0f}"])
+        rows.append([arm, with_half(found, 1), calls, str(unit["lookahead_frames"]), f"{first:.0f}"])
     head = ["arm", "ms a frame", "network calls a frame", "look-ahead, frames", "first frame of a block, ms"]
     return TIMES + "\n" + markdown_table(head, rows)

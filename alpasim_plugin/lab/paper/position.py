@@ -10,7 +10,7 @@ import numpy as np
 
 from alpasim_plugin.lab.learned_metrics.facts import FD_16
 from alpasim_plugin.lab.paper.measured import Measured
-from alpasim_plugin.lab.paper.tables import markdown_table
+from alpasim_plugin.lab.paper.tables import markdown_table, with_half
 from alpasim_plugin.lab.video_metrics.facts import DRIFT, PSNR
 from evaluators.statistics.intervals import t_interval
 
@@ -57,7 +57,7 @@ def by_position(
             windows = [
                 t_interval([float(np.mean(row["series"][metric][low:high])) for row in mine], "clips") for low, high in pairwise(borders)
             ]
-            lines.append([arm, *(with_half(w.centre, w.low, w.high, 2 if metric == PSNR else 4) for w in windows)])
+            lines.append([arm, *(with_half(w, 2 if metric == PSNR else 4) for w in windows)])
         out.append(markdown_table(_head(metric, borders), lines))
     return "\n".join(out)
 
@@ -95,19 +95,9 @@ def windows(measured: Measured, frames: int) -> list[Measured]:
 def drift(measured: Measured, rows: Sequence[Mapping[str, Any]]) -> str:
     """Return PSNR by position of the temporal Harmonizer under both of its trainings, and what it loses to the end."""
     arms = [arm for arm in DRIFTING if arm in measured.values]
-    lines = []
-    for arm in arms:
-        if measured.has(arm, DRIFT):
-            found = measured.mean(arm, DRIFT)
-            lines.append([arm, with_half(found.centre, found.low, found.high, 2)])
+    lines = [[arm, with_half(measured.mean(arm, DRIFT), 2)] for arm in arms if measured.has(arm, DRIFT)]
     lost = markdown_table(["arm", "drift, dB"], lines) if lines else "The clips are too short for a drift of 150 frames.\n"
     return HOW_DRIFT + "\n" + by_position(rows, (PSNR,), DRIFT_WINDOW, arms) + "\n" + lost
-
-
-def with_half(centre: float, low: float | None, high: float | None, digits: int) -> str:
-    """Return a mean with half of its interval, where there is one."""
-    half = "" if low is None or high is None else f" ± {(high - low) / 2:.{digits}f}"
-    return f"{centre:.{digits}f}{half}"
 
 
 def _head(metric: str, borders: Sequence[int]) -> list[str]:

@@ -8,16 +8,16 @@ from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.lab.paper.claims import PER_FRAME
 from alpasim_plugin.lab.paper.measured import ALPHA, Measured, beyond
-from alpasim_plugin.lab.paper.tables import markdown_table
-from alpasim_plugin.lab.paper.verdict import holm
+from alpasim_plugin.lab.paper.tables import markdown_table, with_half
+from alpasim_plugin.lab.video_metrics.charts import DPI
 from alpasim_plugin.lab.video_metrics.facts import PSNR
 from evaluators.statistics.intervals import Interval, t_interval
+from evaluators.statistics.verdicts import holm
 
 OWN, ORACLE, EMPTY = HISTORIES = ("own", "oracle", "empty")
 TRAINED_ON_OWN, TRAINED_ON_CLEAN = "V9-still", "V3b-still"
@@ -27,7 +27,6 @@ AXES: Mapping[str, tuple[float, ...]] = {  # borders of bins
     "frames before it": (0, 4, 16, np.inf),
 }
 LEAST_CLIPS = 5  # that a bin needs
-DPI = 110
 DARK = 0.6  # share of the largest value above which a colour needs light text
 HOW = f"""*Room*: PSNR of `{PER_FRAME}`, rolled out without references, with the truth in place of its own last output, minus that on its
 own history. No training on histories can gain more there. *Paid*: `{TRAINED_ON_OWN}` (trained on its own history) minus
@@ -158,7 +157,7 @@ def regime_section(clips: Sequence[RegimeClip], figure: str) -> str:
 
 
 def _text(one: Bin) -> str:
-    text = f"{one.gain_db.centre:+.3f} ± {((one.gain_db.high or 0) - (one.gain_db.low or 0)) / 2:.3f}"
+    text = with_half(one.gain_db, 3, sign="+")
     return f"**{text}**" if one.shown else text
 
 
@@ -168,7 +167,6 @@ def plot_regime(clips: Sequence[RegimeClip], path: Path) -> None:
     rows, columns, panels = (len(borders) - 1 for borders in AXES.values())
     most = max((abs(one.gain_db.centre) for one in found.values()), default=0.0) or 1.0
     figure = Figure(figsize=(3.4 * panels + 0.8, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
     for k, ax in enumerate(figure.subplots(1, panels, squeeze=False)[0]):
         grid = np.full((rows, columns), np.nan)
         for i, j in product(range(rows), range(columns)):

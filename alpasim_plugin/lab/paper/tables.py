@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from alpasim_plugin.lab.paper.measured import Difference, Measured
 from alpasim_plugin.lab.paper.published import PaperMetric, Published
 from alpasim_plugin.lab.paper.verdict import ORACLE, Judged
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.lab.video_metrics.table import DIGITS, SCALE
+from evaluators.statistics.intervals import Interval
 
 NOT_RUN = "not run"
 NO_COUNTERPART = "no counterpart here"
@@ -23,9 +24,9 @@ def paper_against_ours(published: Published, table: str, measured: Measured) -> 
     """
     printed = published.tables[table]
     head = ["arm", "", *(f"{published.metrics[m].heading} {ARROWS[published.metrics[m].better]}" for m in printed.metrics)]
-    rows = [["", "*ours*", *(f"`{ours}`" if (ours := published.ours(m)) else "-" for m in printed.metrics)]]
-    for arm, cells in printed.rows.items():
-        rows.append([f"**{arm}**", "paper", *(cells[m].text if m in cells else "not reported" for m in printed.metrics)])
+    rows = [["", "*ours*", *(f"`{ours}`" if (ours := published.metrics[m].ours) else "-" for m in printed.metrics)]]
+    for arm in printed.rows:
+        rows.append([f"**{arm}**", "paper", *("not reported" if cell == "-" else cell for cell in printed.cells(arm))])
         missing = NO_COUNTERPART if arm in printed.no_counterpart else NOT_RUN
         rows.append(["", "ours", *_line_of(published, printed.metrics, arm, measured, missing)])
     others = [arm for arm in measured.arms if arm not in printed.rows]
@@ -48,12 +49,23 @@ def interval_text(measured: Measured, arm: str, metric: str, scale: float = 1.0)
     """Return an arm's mean with the half-width of its interval, ``null`` where it was not measured on two clips."""
     if not measured.has(arm, metric):
         return "null"
-    found = measured.mean(arm, metric)
     digits = 1 if scale > 1 else 4 if metric in SCALE else (DIGITS | SET_DIGITS).get(metric, 3)
-    text = f"{found.centre * scale:.{digits}f}"
-    if found.low is None or found.high is None:
-        return text
-    return f"{text}±{(found.high - found.low) / 2 * scale:.{digits}f}"
+    return with_half(measured.mean(arm, metric), digits, scale, "±")
+
+
+def with_half(found: Interval, digits: int, scale: float = 1.0, between: str = " ± ", sign: str = "") -> str:
+    """Return a mean with half of its interval, where there is one."""
+    half = "" if found.low is None or found.high is None else f"{between}{(found.high - found.low) / 2 * scale:.{digits}f}"
+    return f"{found.centre * scale:{sign}.{digits}f}{half}"
+
+
+def means_table(measured: Measured, metrics: Sequence[str], digits: Mapping[str, int], usual: int) -> str:
+    """Return every arm's means with half of their intervals: what the paper has no table for."""
+    rows = [
+        [arm, *(with_half(measured.mean(arm, m), digits.get(m, usual)) if measured.has(arm, m) else "null" for m in metrics)]
+        for arm in measured.arms
+    ]
+    return markdown_table(["arm", *metrics], rows)
 
 
 def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ from alpasim_plugin.lab.learned_metrics.facts import FVMD_LK
 from alpasim_plugin.lab.paper.claims import LAST, MID, OURS, PERCEPTUAL, PSNR, WARP
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.published import Published
-from alpasim_plugin.lab.paper.tables import differences, markdown_table, paper_against_ours
+from alpasim_plugin.lab.paper.tables import differences, means_table, paper_against_ours
 
 TRANSFER, PHOTOGRAPHS = "transfer", "transfer-photographs"
 COMPARED = (OURS, "difix", "artifixer", "artifixer@4")  # the arms of the paper's table that are trained here
@@ -70,7 +70,12 @@ def transfer_section(published: Published, measured: Mapping[str, Measured]) -> 
     mine = measured[TRANSFER]
     parts = [HOW, paper_against_ours(published, "transfer", mine), _differences(mine), f"\n{_clips(mine)} held-out scenes.\n"]
     if PHOTOGRAPHS in measured:
-        parts += ["### Photographs\n", PHOTOGRAPHED, _table(measured[PHOTOGRAPHS]), _differences(measured[PHOTOGRAPHS])]
+        parts += [
+            "### Photographs\n",
+            PHOTOGRAPHED,
+            means_table(measured[PHOTOGRAPHS], METRICS, {PSNR: 2, FVMD_LK: 0}, 4),
+            _differences(measured[PHOTOGRAPHS]),
+        ]
     return "\n".join(parts)
 
 
@@ -80,22 +85,6 @@ def _differences(measured: Measured) -> str:
         return ""
     metrics = [metric for metric in METRICS if measured.has(lead, metric)]
     return "\n" + differences(measured, lead, [arm for arm in measured.arms if arm != lead], metrics)
-
-
-def _table(measured: Measured) -> str:
-    """Return our values alone: the paper has no such table."""
-    rows = []
-    for arm in measured.arms:
-        cells = []
-        for metric in METRICS:
-            if not measured.has(arm, metric):
-                cells.append("null")
-                continue
-            found, digits = measured.mean(arm, metric), {PSNR: 2, FVMD_LK: 0}.get(metric, 4)
-            half = "" if found.low is None or found.high is None else f" ± {(found.high - found.low) / 2:.{digits}f}"
-            cells.append(f"{found.centre:.{digits}f}{half}")
-        rows.append([arm, *cells])
-    return markdown_table(["arm", *METRICS], rows)
 
 
 def _clips(measured: Measured) -> int:

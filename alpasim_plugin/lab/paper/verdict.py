@@ -20,6 +20,7 @@ from alpasim_plugin.lab.paper.claims import CLAIMS, DRIFT, PER_FRAME, PSNR, RAW,
 from alpasim_plugin.lab.paper.measured import ALPHA, Difference
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from evaluators.statistics.intervals import Interval
+from evaluators.statistics.verdicts import holm
 
 Outcome = Literal["for", "against", "open", "not trained", "not measured"]
 Verdict = Literal["does not hold", "not measured", "not trained", "no room for a history", "undecided", "holds"]
@@ -172,24 +173,6 @@ def _oracle(claim: Claim, measured: Mapping[str, Evidence]) -> Difference | None
         if found is not None and found.compares(PSNR, f"{arm}, {ORACLE}", arm):
             return found.difference(PSNR, f"{arm}, {ORACLE}", arm)
     return None
-
-
-def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Return p-values corrected for their number by Holm's step-down method; what is None is no test and stays so.
-
-    Source: Holm, Scandinavian Journal of Statistics 6 (1979).
-
-    Example:
-        >>> holm([0.01, None, 0.04, 0.03])
-        [0.03, None, 0.06, 0.06]
-    """
-    tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
-    out: list[float | None] = [None] * len(p_values)
-    largest = 0.0
-    for rank, (p, i) in enumerate(tested):
-        largest = max(largest, min((len(tested) - rank) * p, 1.0))
-        out[i] = largest
-    return out
 
 
 def _result(one: Comparison, measured: Evidence | None) -> Result:

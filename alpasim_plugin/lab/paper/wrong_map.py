@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from alpasim_plugin.lab.paper.measured import Measured
-from alpasim_plugin.lab.paper.tables import markdown_table
-from alpasim_plugin.lab.video_metrics.facts import KNOWN
+from alpasim_plugin.lab.paper.tables import markdown_table, means_table
+from alpasim_plugin.lab.video_metrics.charts import DPI, finish, legend, panels_of
 
-DPI = 110
 METRICS = ("lane_f1_syn", "lane_xerr_syn_m", "cuboid_f1_syn", "fd_syn_16", "psnr_db", "perceptual-syn")
 PANELS = (("lane_f1_syn", "lanes"), ("lane_xerr_syn_m", "lanes"), ("cuboid_f1_syn", "boxes"), ("fd_syn_16", "lanes"))
 HOW = """Lanes and boxes of the semantic map moved by a constant, 45 configurations: lanes by -0.5 to 0.5 m to the left, boxes by
@@ -45,18 +40,7 @@ def means(measured: Measured) -> str:
         measured: Groups of configurations, and the arms beside them.
     """
     metrics = [m for m in METRICS if any(measured.has(arm, m) for arm in measured.arms)]
-    rows = []
-    for arm in measured.arms:
-        cells = []
-        for metric in metrics:
-            if not measured.has(arm, metric):
-                cells.append("null")
-                continue
-            found = measured.mean(arm, metric)
-            half = "" if found.low is None or found.high is None else f" ± {(found.high - found.low) / 2:.3f}"
-            cells.append(f"{found.centre:.3f}{half}")
-        rows.append([arm, *cells])
-    return HOW + "\n" + markdown_table(["arm", *metrics], rows)
+    return HOW + "\n" + means_table(measured, metrics, {}, 3)
 
 
 def ranges(measured: Measured, shifts: Mapping[str, Shift]) -> str:
@@ -92,11 +76,7 @@ def plot(measured: Measured, shifts: Mapping[str, Shift], path: Path) -> None:
         path: Of the PNG.
     """
     shown = [(metric, what) for metric, what in PANELS if any(measured.has(arm, metric) for arm in shifts)]
-    figure = Figure(figsize=(10.4, 3.1 * -(-max(len(shown), 1) // 2) + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels: list[Axes] = list(figure.subplots(-(-max(len(shown), 1) // 2), 2, squeeze=False).ravel())
-    for ax in panels[len(shown) :]:
-        ax.set_visible(False)
+    figure, panels = panels_of(max(len(shown), 1))
     beside = [arm for arm in measured.arms if arm not in shifts]
     true = [arm for arm, shift in shifts.items() if shift == Shift(0.0, 0.0)]
     for ax, (metric, what) in zip(panels, shown, strict=False):
@@ -108,14 +88,8 @@ def plot(measured: Measured, shifts: Mapping[str, Shift], path: Path) -> None:
             ax.plot([0], [measured.mean(arm, metric).centre], "ko", markersize=4, label="true map")
         ax.set_xticks(range(len(groups)), [f"{distance:.2f}" for distance in groups])
         ax.set_xlabel(f"{what} off by, m")
-        ax.set_ylabel(metric)
-        ax.set_title(f"{KNOWN.info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
-        ax.grid(visible=True, alpha=0.25)
-        ax.spines[["top", "right"]].set_visible(False)
-    handles: dict[str, Any] = {
-        label: handle for ax in panels[: len(shown)] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+        finish(ax, metric)
+    legend(figure, panels)
     figure.savefig(path, dpi=DPI)
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from alpasim_plugin.lab.video_metrics.facts import FACTS, MS, PSNR, SSIM, WARP
+from alpasim_plugin.lab.video_metrics.facts import FACTS, KNOWN, MS, PSNR, SSIM, WARP
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
 
 LABELS = {PSNR: "PSNR, dB", SSIM: "SSIM", WARP: "Warp L1"}
@@ -26,7 +25,7 @@ def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
     """Draw every metric's mean over clips in windows of frames and write a PNG; few variants have 95 % bands."""
     by_frame = summary["by_frame"]
     metrics = [m for m in FACTS if any(m in windows for windows in by_frame.values())]
-    figure, panels = _panels(len(metrics))
+    figure, panels = panels_of(len(metrics))
     banded = len([variant for variant in by_frame if variant != TRUTH]) <= MOST_BANDED
     for ax, metric in zip(panels, metrics, strict=True):
         for variant, colour, dash in _styles(summary):
@@ -38,8 +37,8 @@ def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
             if banded and summary["clips"][variant] >= LEAST_BANDED:
                 ax.fill_between(x, windows["low"], windows["high"], color=colour, alpha=0.13, linewidth=0)
         ax.set_xlabel("frame")
-        _finish(ax, metric)
-    _legend(figure, panels)
+        finish(ax, metric)
+    legend(figure, panels)
     figure.savefig(path, dpi=DPI)
 
 
@@ -50,7 +49,7 @@ def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
     """
     variants, paired, baseline = summary["arms"], summary["paired"], summary["baseline"]
     metrics = [m for m in (PSNR, SSIM, "perceptual-syn", "lpips_alex", WARP) if any(m in values for values in variants.values())]
-    figure, panels = _panels(len(metrics))
+    figure, panels = panels_of(len(metrics))
     timed = [values[MS]["mean"] for values in variants.values() if MS in values]
     for ax, metric in zip(panels, metrics, strict=True):
         for i, (variant, colour, dash) in enumerate(_styles(summary)):
@@ -73,8 +72,8 @@ def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
             ax.xaxis.set_major_formatter(ScalarFormatter())
             ax.xaxis.set_minor_formatter(NullFormatter())
         ax.margins(x=0.15, y=0.15)
-        _finish(ax, metric)
-    _legend(figure, panels)
+        finish(ax, metric)
+    legend(figure, panels)
     figure.savefig(path, dpi=DPI)
 
 
@@ -95,23 +94,26 @@ def _styles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return out
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
+def panels_of(count: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with so many panels in two columns."""
     lines = -(-count // COLUMNS)
     figure = Figure(figsize=(5.2 * COLUMNS, 3.1 * lines + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = list(figure.subplots(lines, COLUMNS, squeeze=False).ravel())
     for ax in panels[count:]:
         ax.set_visible(False)
     return figure, panels[:count]
 
 
-def _finish(ax: Axes, metric: str) -> None:
-    ax.set_ylabel(LABELS.get(metric, metric))
-    ax.set_title(f"{FACTS[metric].direction} is better", fontsize=8, loc="right", color="0.4")
-    ax.grid(visible=True, alpha=0.25)
+def finish(ax: Axes, metric: str, note: str = "", axis: Literal["both", "x", "y"] = "both") -> None:
+    """Say in a panel which side is better, label the metric where it is the other axis, and leave out what says nothing."""
+    if axis == "both":
+        ax.set_ylabel(LABELS.get(metric, metric))
+    ax.set_title(f"{KNOWN.info(metric).direction} is better{note}", fontsize=8, loc="right", color="0.4")
+    ax.grid(visible=True, axis=axis, alpha=0.25)
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(figure: Figure, panels: list[Axes]) -> None:
+def legend(figure: Figure, panels: list[Axes], columns: int = 5) -> None:
+    """Name what the panels show below them, once each."""
     handles = {label: handle for ax in panels for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 5), fontsize=9, frameon=False)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), columns), fontsize=9, frameon=False)

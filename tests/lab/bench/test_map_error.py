@@ -13,7 +13,7 @@ from alpasim_plugin.core.types import F64, U8, Scenario
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.bench.map_error import CONFIGURATIONS, MapShift, shifted_maps
-from alpasim_plugin.lab.bench.paper import Compared, black_map, findings, grouped
+from alpasim_plugin.lab.bench.paper import black_map, grouped, shifted
 from alpasim_plugin.lab.paper import wrong_map
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.semantic_map.draw import draw_map
@@ -66,9 +66,7 @@ def test_a_box_is_over_configurations_and_its_dot_is_the_true_map(tmp_path: Path
     found_at = {shift.label: {"lane_f1_syn": 0.9 - abs(shift.lanes_left_m), "psnr_db": 20.0} for shift in CONFIGURATIONS}
     values = {f"V9 {label}": {clip: found for clip in "ab"} for label, found in found_at.items()}
     raw = Measured({**values, "V5": {clip: {"lane_f1_syn": 0.3} for clip in "ab"}})
-    found = findings(Compared(measured={"map-error": grouped(raw)}, shifted=raw)).shifted
-    assert found is not None
-    measured, shifts = found
+    measured, shifts = shifted(raw)
     assert len(shifts) == 45
     lines = wrong_map.ranges(measured, shifts).splitlines()
     assert "| lanes 0.25 m | 18 | 0.650 (0.650 to 0.650) | 20.000 (20.000 to 20.000) |" in lines

@@ -13,7 +13,7 @@ from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.lab.paper.claims import Claim, Comparison, Relation, margin
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.record import record_of, recorded
-from alpasim_plugin.lab.paper.verdict import holm, judge_claims
+from alpasim_plugin.lab.paper.verdict import judge_claims
 from tests.lab.paper.arm_cases import CLIPS, arms
 
 
@@ -125,11 +125,6 @@ def test_a_lost_contest_refutes_if_it_is_lost_among_so_many(p_value: float, othe
     assert judged.verdict == verdict
     assert judged.count("against") == (p_value < 0.05), "by its own interval it is lost all the same"
     assert judged.results[0].refutes == pytest.approx(min(p_value / 2 * (others + 1), 1.0))
-
-
-def test_the_correction_is_holms() -> None:
-    assert holm([0.01, None, 0.04, 0.03]) == pytest.approx([0.03, None, 0.06, 0.06])
-    assert holm([None]) == [None]
 
 
 @pytest.mark.parametrize(("level", "verdict"), [(0.97, "holds"), (0.85, "does not hold"), (0.9, "undecided")])
