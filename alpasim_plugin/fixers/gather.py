@@ -14,6 +14,7 @@ from torch import Tensor
 
 from alpasim_plugin.fixers.views import HALF
 from alpasim_plugin.nets.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
+from alpasim_plugin.nets.pixel_layers import cpu_operator
 from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, MATCH_CELLS, NOWHERE, OFFSET_PX, BesideCells, BlendHeads
 from alpasim_plugin.plugins.kernels import njit
 
@@ -169,7 +170,7 @@ def _put_runs(row, cells, at, run):
             cell[at + i] = row[run * j + i]
 
 
-@torch.library.custom_op("simrun::likeness", mutates_args=(), device_types="cpu")
+@cpu_operator("likeness(Tensor sought, Tensor shown) -> Tensor")
 def likeness_cpu(sought: Tensor, shown: Tensor) -> Tensor:
     """Return the same as `nets.reference_blend.likeness`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
     reach = 2 * MATCH_CELLS + 1
@@ -211,7 +212,7 @@ def _likeness(sought, shown, out):
             _write(row.reshape(-1), out[n, i].reshape(-1))
 
 
-@torch.library.custom_op("simrun::offsets", mutates_args=(), device_types="cpu")
+@cpu_operator("offsets(Tensor at2, Tensor at4) -> Tensor")
 def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
     """Return the same as `nets.reference_blend.offsets`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
     out = torch.empty(at2.shape)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from functools import cache
+from functools import cache, wraps
 from typing import Any, NamedTuple
 
 import torch
@@ -25,11 +25,27 @@ SLOPE = 0.1  # of the leaky activation
 SMALL = 0.1  # scale of a branch's initial output: the network starts near the identity
 STRIDE = 4  # frames from one that is kept to the next
 HEADS, WAVES = 2, 4
+OPERATORS = torch.library.Library("simrun", "DEF")  # type: ignore[no-untyped-call] # the operators live as long as it
 
 
 def activation(x: Tensor, inplace: bool = False) -> Tensor:
     """Apply the leaky rectifier; ``inplace`` where nothing else reads ``x``."""
     return F.leaky_relu(x, SLOPE, inplace)
+
+
+def cpu_operator(schema: str) -> Callable[[Callable[..., Tensor]], Callable[..., Tensor]]:
+    """Make a function on the CPU an operator, which a recording of the network calls.
+
+    ``torch.library.custom_op`` would do the same, and load the compiler of graphs at the first call: a second of every worker.
+    """
+
+    def make(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        name = OPERATORS.define(schema)  # type: ignore[no-untyped-call]
+        OPERATORS.impl(name, function, "CPU")  # type: ignore[no-untyped-call]
+        operator = getattr(torch.ops.simrun, name)
+        return wraps(function)(lambda *tensors: operator(*tensors))
+
+    return make
 
 
 def cells(x: Tensor, side: int) -> Tensor:
