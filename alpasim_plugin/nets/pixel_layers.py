@@ -105,13 +105,17 @@ class Dense(nn.Linear):
 def pack(net: nn.Module) -> None:
     """Lay the weights of a network out as oneDNN's kernels read them, once instead of at every call; it has no gradient any more.
 
-    Layers then add their bias and apply their activation before they round, in the pass that multiplies.
+    Layers then add their bias and apply their activation before they round, in the pass that multiplies. With less than AVX-512 the kernel
+    of a convolution depends on the size of the picture, and the layout with it: those weights stay as they are, as do those in bfloat16.
     """
+    wide = "AVX512" in torch.backends.cpu.get_cpu_capability()
     for layer in net.modules():
-        if isinstance(layer, Conv3):
-            layer.packed = torch.ops.mkldnn._reorder_convolution_weight(layer.weight, [1, 1], [1, 1], [1, 1], 1)
-        elif isinstance(layer, Dense):
-            layer.packed = torch.ops.mkldnn._reorder_linear_weight(layer.weight)
+        if isinstance(layer, (Conv3, Dense)) and (wide or layer.weight.dtype == torch.float32):
+            weight = layer.weight.detach()
+            if isinstance(layer, Dense):
+                layer.packed = torch.ops.mkldnn._reorder_linear_weight(weight)
+            else:
+                layer.packed = torch.ops.mkldnn._reorder_convolution_weight(weight, [1, 1], [1, 1], [1, 1], 1) if wide else weight
 
 
 @cache
