@@ -105,11 +105,11 @@ def judged(log: RolloutLog, scene: Scene) -> dict[str, float | None]:
     return {name: values[name].value if values[name].valid else None for name in (EVENT, DISTANCE)}
 
 
-def one_drive(path: Path, what: str, renderer: str, share: float) -> dict[str, Any]:
-    """Drive a scene, and give its numbers and its processor milliseconds per frame."""
+def one_drive(path: Path, what: str, renderer: str, share: float, given: Sequence[str] = (), size: str = "") -> dict[str, Any]:
+    """Drive a scene, and give its numbers and its processor milliseconds per frame; ``given`` sets the fixer, ``size`` the camera."""
     ref, us = expand(str(path))[0], duration_us(path, SECONDS)
-    scenario = load_scenario(path, ref.seed, overrides(what, us))
-    setting = ("precision=bf16",) if what == "fixer precision" else ("precision=fp32",)
+    scenario = load_scenario(path, ref.seed, [*overrides(what, us), *([size] if size else [])])
+    setting = ("precision=bf16" if what == "fixer precision" else "precision=fp32", *given)
     with halved(what, share):
         made = make_renderer(renderer, scenario, threads=1, overrides=setting if renderer == FIXED else ())
         policy = make_policy(POLICY, scenario)
