@@ -105,10 +105,13 @@ def judged(log: RolloutLog, scene: Scene) -> dict[str, float | None]:
     return {name: values[name].value if values[name].valid else None for name in (EVENT, DISTANCE)}
 
 
-def one_drive(path: Path, draw: int, what: str, renderer: str, share: float) -> dict[str, Any]:
-    """Drive a scene as jitter draws it, and give its numbers and its processor milliseconds per frame."""
-    scenario = load_scenario(path, draw, overrides(what, duration_us(path, SECONDS)))
-    setting = ("precision=bf16",) if what == "fixer precision" else ("precision=fp32",)
+def one_drive(path: Path, draw: int, what: str, renderer: str, share: float, given: Sequence[str] = (), size: str = "") -> dict[str, Any]:
+    """Drive a scene as jitter draws it, and give its numbers and its processor milliseconds per frame.
+
+    ``given`` sets the fixer, ``size`` the camera.
+    """
+    scenario = load_scenario(path, draw, [*overrides(what, duration_us(path, SECONDS)), *([size] if size else [])])
+    setting = ("precision=bf16" if what == "fixer precision" else "precision=fp32", *given)
     with halved(what, share):
         made = make_renderer(renderer, scenario, threads=1, overrides=setting if renderer == FIXED else ())
         policy = make_policy(POLICY, scenario)
