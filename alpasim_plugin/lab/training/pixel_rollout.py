@@ -161,7 +161,7 @@ def pixel_losses(
     weight = torch.ones_like(sample.opacity)
     if sample.road_users is not None:
         weight = weight + (ROAD_USER - 1) * sample.road_users
-    weight = weight / weight.mean()
+    weight = weight / weight.mean(dim=tuple(range(1, weight.ndim)), keepdim=True)  # row by row: the loss of rows is the mean of theirs
     picture = (weight * (made - sample.truth).abs()).mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
     temporal = (weight[:, 1:] * moved.abs()).mean() if objectives.temporal and frames > 1 else zero
