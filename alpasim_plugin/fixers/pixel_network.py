@@ -127,7 +127,8 @@ class GeneratorStep:
         past = state._replace(output=smaller(state.output, scale), render=smaller(state.render, scale))
         beside = None if references is None or self.net.blend is None else self.beside(references, seen, scale)
         noised = seen if source is render else smaller(source, scale)
-        made = self.before_blend(seen, smaller(opacity, scale), smaller(sdmap, scale), past, noised, beside, t)
+        cells = self.gather(seen, smaller(opacity, scale), smaller(sdmap, scale), past, noised)
+        made = self.before_blend(cells, seen, past, t, beside)
         out, recorded = made.repaired, torch.zeros_like(render[..., :1])
         if scale > 1:
             out = render + larger(made.repaired - seen, scale)
@@ -135,23 +136,20 @@ class GeneratorStep:
             out, recorded = self.mix(out, references, made.heads, scale)
         return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
 
+    def gather(self, *images: Any) -> GatheredCells:
+        """Gather what the network reads beside references; see `nets.pixel_generator.gather_cells`, whose arguments these are."""
+        return gather_cells(*images)
+
     def beside(self, references: Tensor, render: Tensor, scale: int) -> BesideCells:
         """Gather what the network reads of references that are ``scale`` times larger than the render."""
         seen = smaller(in_floats(references).flatten(0, 1), scale)
         return gather_beside(seen.view(*references.shape[:2], *seen.shape[1:]), render)
 
     def before_blend(
-        self,
-        render: Tensor,
-        opacity: Tensor,
-        sdmap: Tensor,
-        past: PixelState,
-        source: Tensor,
-        beside: BesideCells | None,
-        t: Tensor | None,
+        self, cells: GatheredCells, render: Tensor, past: PixelState, t: Tensor | None, beside: BesideCells | None
     ) -> BeforeBlend:
         """Run the network on what it looks at."""
-        return self.net.before_blend(gather_cells(render, opacity, sdmap, past, source), render, past, t, beside)
+        return self.net.before_blend(cells, render, past, t, beside)
 
     def mix(self, repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int) -> tuple[Tensor, Tensor]:
         """Blend at full size; see `nets.reference_blend`."""
@@ -172,24 +170,21 @@ class RecordedStep(GeneratorStep):
         self._calls: Counter[tuple[int, ...]] = Counter()
         self.recorded: dict[tuple[int, ...], Any] = {}
 
+    def gather(self, *images: Any) -> GatheredCells:
+        """Gather in one compiled pass."""
+        return gather_cells_cpu(*images, dtype=self.net.stem.weight.dtype)
+
     def beside(self, references: Tensor, render: Tensor, scale: int) -> BesideCells:
         """Gather in one compiled pass."""
         return gather_beside_cpu(references, render, scale, self.net.stem.weight.dtype)
 
     def before_blend(
-        self,
-        render: Tensor,
-        opacity: Tensor,
-        sdmap: Tensor,
-        past: PixelState,
-        source: Tensor,
-        beside: BesideCells | None,
-        t: Tensor | None,
+        self, cells: GatheredCells, render: Tensor, past: PixelState, t: Tensor | None, beside: BesideCells | None
     ) -> BeforeBlend:
         """Run the network, or its recording, on what it looks at."""
-        cells, read = gather_cells_cpu(render, opacity, sdmap, past, source, self.net.stem.weight.dtype), beside or ()
         if t is not None:
-            return self.net.before_blend(cells, render, past, t, beside)
+            return super().before_blend(cells, render, past, t, beside)
+        read = beside or ()
         tensors = *cells, render, *past, *read
         shape = *render.shape, *(part.shape[0] for part in read)
         self._calls[shape] += 1
