@@ -136,9 +136,9 @@ class GeneratorStep:
             out, recorded = self.mix(out, references, made.heads, scale)
         return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded)
 
-    def gather(self, *images: Any) -> GatheredCells:
+    def gather(self, render: Tensor, opacity: Tensor, sdmap: Tensor, past: PixelState, source: Tensor) -> GatheredCells:
         """Gather what the network reads beside references; see `nets.pixel_generator.gather_cells`, whose arguments these are."""
-        return gather_cells(*images)
+        return gather_cells(render, opacity, sdmap, past, source)
 
     def beside(self, references: Tensor, render: Tensor, scale: int) -> BesideCells:
         """Gather what the network reads of references that are ``scale`` times larger than the render."""
@@ -170,9 +170,9 @@ class RecordedStep(GeneratorStep):
         self._calls: Counter[tuple[int, ...]] = Counter()
         self.recorded: dict[tuple[int, ...], Any] = {}
 
-    def gather(self, *images: Any) -> GatheredCells:
+    def gather(self, render: Tensor, opacity: Tensor, sdmap: Tensor, past: PixelState, source: Tensor) -> GatheredCells:
         """Gather in one compiled pass."""
-        return gather_cells_cpu(*images, dtype=self.net.stem.weight.dtype)
+        return gather_cells_cpu(render, opacity, sdmap, past, source, self.net.stem.weight.dtype)
 
     def beside(self, references: Tensor, render: Tensor, scale: int) -> BesideCells:
         """Gather in one compiled pass."""
