@@ -216,7 +216,7 @@ def _likeness(sought, shown, out):
 def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
     """Return the same as `nets.reference_blend.offsets`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
     out = torch.empty(at2.shape)
-    _offsets(_array(at2), np.ascontiguousarray(_array(at4)), out.numpy())  # the first is a part of what the head says, read in its place
+    _offsets(_array(at2), np.ascontiguousarray(_array(at4)), out.flatten(2).numpy())  # the first is a part of what the head says, read in its place
     return out
 
 
@@ -243,8 +243,7 @@ def _offsets(at2, at4, out):
                 fallen[x] = -two * abs(row[x])
             _exponentials(fallen)
             for x in range(len(row)):  # tanh |x| = (1 - exp(-2 |x|)) / (1 + exp(-2 |x|))
-                row[x] = np.copysign(most * (one - fallen[x]) / (one + fallen[x]), row[x])
-            out[n, y] = row.reshape(width, axes)
+                out[n, y, x] = np.copysign(most * (one - fallen[x]) / (one + fallen[x]), row[x])
 
 
 def mix_cpu(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1) -> tuple[Tensor, Tensor]:

@@ -33,6 +33,7 @@ from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_
 from alpasim_plugin.nets.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
 from alpasim_plugin.nets.pixel_layers import pack
 from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
+from alpasim_plugin.plugins import kernels
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -246,8 +247,8 @@ def _record(step: _Step, tensors: tuple[Tensor, ...]) -> Any:
         return torch.jit.freeze(torch.jit.trace(step, plain, check_trace=False))  # type: ignore[no-untyped-call]
 
 
-def draw_and_gather() -> None:
-    """Draw a line and a car, carry a picture into another view and gather its cells: tiny cases of all kernels of what a fixer reads."""
+def draw_and_warp() -> None:
+    """Draw a line and a car, and carry a picture into another view: tiny cases of the kernels of what a fixer is given."""
     from alpasim_plugin.core.geometry import se2
     from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
     from alpasim_plugin.fixers.ground import carry
@@ -270,10 +271,19 @@ def draw_and_gather() -> None:
     for focal_px in (8.0, 80.0):  # the car fills a part of the picture's rows, and all of them
         zoomed = np.array([[focal_px, 0, 8], [0, focal_px, 8], [0, 0, 1]])
         on_boxes(depth.shape, place_boxes(depth.shape, zoomed, ahead, {"car": T_world_car}, {"car": box}).seen)
+    image = np.zeros((side_px, side_px, 3), np.float32)
+    trust(image, image, depth)
 
+
+def gather_and_mix() -> None:
+    """Gather the cells of a picture and of a reference, and blend them: tiny cases of the kernels of a network.
+
+    Of the precision that is chosen on this processor; where a package is filled, of both: a precision costs as much as all other kernels.
+    """
+    side_px = 16
     image, references = torch.zeros(1, side_px, side_px, 3), torch.zeros(1, 1, side_px, side_px, 4, dtype=torch.uint8)
     state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image, image[..., :1])
-    for dtype in (torch.float32, torch.bfloat16):
+    for dtype in DTYPES.values() if kernels.fills() else [DTYPES[choose_precision().name]]:
         gather_cells_cpu(image, image[..., :1], image, state, image + 1, dtype)
         gather_beside_cpu(references, image, 1, dtype)
         at2, at4 = (image[:, ::side, ::side].to(dtype) for side in (DETAIL, CELL))
@@ -282,4 +292,3 @@ def draw_and_gather() -> None:
         heads = BlendHeads(weight, offsets_cpu(offset[:, 0], at4[..., :2])[:, None], correction)
         likeness_cpu(at4, at4)
         mix_cpu(image, references, heads)
-    trust(image[0].numpy(), image[0].numpy(), image[0, ..., 0].numpy())

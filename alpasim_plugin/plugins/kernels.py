@@ -33,10 +33,11 @@ from alpasim_plugin.io.places import MADE
 from alpasim_plugin.plugins.parts.source import own_code_digest
 
 COMPILED = MADE / "compiled"
-SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
+SUBJECTS = {  # subject -> tiny case, imported in the process that compiles; two at a time, in this order, leave no core idle for long
+    "map": "alpasim_plugin.fixers.pixel_network:draw_and_warp",
     "rasteriser": "alpasim_plugin.gaussians.sample_scene:rasterise",
-    "gradient": "alpasim_plugin.gaussians.sample_scene:fit",
-    "map": "alpasim_plugin.fixers.pixel_network:draw_and_gather",
+    "network": "alpasim_plugin.fixers.pixel_network:gather_and_mix",
+    "gradient": "alpasim_plugin.gaussians.sample_scene:fit",  # last: it calls much of what the rasteriser has compiled by then
 }
 # Level, best first -> what a processor must have, and how the code differs from what the level's name alone gives.
 V3 = frozenset({"avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"})
@@ -154,6 +155,11 @@ def call(subject: str) -> None:
     """Run the tiny case of a subject: what it calls is compiled, or loaded."""
     module, _, case = SUBJECTS[subject].partition(":")
     getattr(importlib.import_module(module), case)()
+
+
+def fills() -> bool:
+    """Tell whether this process compiles what a package will hold, for users of any setting."""
+    return _filled is not None
 
 
 def fill(folder: Path) -> None:

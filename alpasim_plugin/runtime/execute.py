@@ -69,7 +69,7 @@ def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]
         if cell.renderer.base.name == "3dgs" and is_reconstructed(scenarios[cell.scene]):
             found.add("gradient")
         if cell.renderer.fixer is not None:
-            found.add("map")
+            found |= {"map", "network"}
     return [subject for subject in kernels.SUBJECTS if subject in found]
 
 
