@@ -216,7 +216,7 @@ def _likeness(sought, shown, out):
 def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
     """Return the same as `nets.reference_blend.offsets`, of float32 or bfloat16 tensors on the CPU, to rounding; it has no gradient."""
     out = torch.empty(at2.shape)
-    _offsets(_array(at2), np.ascontiguousarray(_array(at4)), out.flatten(2).numpy())  # the first is a part of what the head says, read in its place
+    _offsets(_array(at2), np.ascontiguousarray(_array(at4)), out.flatten(2).numpy())  # the first: part of what the head says, in place
     return out
 
 

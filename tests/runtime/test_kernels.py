@@ -80,6 +80,7 @@ def test_a_drive_compiles_nothing_that_its_subjects_did_not(tmp_path: Path) -> N
     caches = {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "SIMRUN_CACHE": str(tmp_path / "simrun")}
     command = [sys.executable, "-c", COMPILED_LATER, str(tmp_path / "run")]
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | caches)
-    assert "text: []" in done.stdout.splitlines()  # an array that is assigned to a part of another costs two seconds: numba's error has text
+    # An array that is assigned to a part of another costs two seconds: numba's error for wrong shapes is text.
+    assert "text: []" in done.stdout.splitlines()
     assert done.stdout.splitlines()[-1] == "compiled later: []"
     assert done.stderr.count("once on this machine:") == len(SUBJECTS)
