@@ -31,7 +31,8 @@ from policies import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 
-SUITE, SCENE = "suites/first", 1  # the README's, a winding street at 512x288
+SUITE, SCENE = "suites/first", 1  # the README's, a winding street
+SIZES = ((512, 288), (256, 144))  # its own, and that of most shipped scenes
 POLICY = "lane-camera"
 STAGES = ("render", "references", "map", "fix", "policy", "control", "actors", "log")
 REFERENCE_SIDE = 768  # of the matrices of the reference work: 0.9 billion floating-point operations
@@ -48,6 +49,7 @@ class FrameCost:
 
     Attributes:
         renderer: Its name.
+        size: Width and height of the camera's picture, pixels.
         frames: How many the means are over.
         ms: Mean processor time by stage, on one thread; each pass through a stage with its least time of the repeats.
         psnr_db: Of the frames that the policy saw, against the scene as built from the same poses; 100 for equal ones.
@@ -55,6 +57,7 @@ class FrameCost:
     """
 
     renderer: str
+    size: tuple[int, int]
     frames: int
     ms: Mapping[str, float]
     psnr_db: float
@@ -86,17 +89,16 @@ def bench_loop(renderers: Sequence[str], repeats: int = 3, seconds: float = 6.0)
     Returns:
         ``machine``, ``versions``, ``scene``, ``repeats``, ``reference_ms``; ``frames`` and ``commands``, each time with its ``ratio``.
     """
-    ref = expand(SUITE)[SCENE]
-    loaded = load_scenario(ref.path, ref.seed, ref.overrides)
-    scenario = replace(loaded, end_us=min(loaded.end_us, loaded.start_us + int(1e6 * seconds)))
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         reference = [reference_ms()]
         frames = []
-        for renderer in renderers:
-            frames.append(frame_cost(renderer, scenario, repeats))
-            reference.append(reference_ms())
+        for size in SIZES:
+            scenario = scene(size, seconds)
+            for renderer in renderers:
+                frames.append(frame_cost(renderer, scenario, repeats))
+                reference.append(reference_ms())
         with temporary_folder("simrun-") as folder:
             commands = [command_cost(name, Path(folder), repeats) for name in COMMANDS]
         reference.append(reference_ms())
@@ -107,6 +109,13 @@ def bench_loop(renderers: Sequence[str], repeats: int = 3, seconds: float = 6.0)
         "frames": [_frame_row(cost, min(reference)) for cost in frames],
         "commands": [_command_row(cost, min(reference)) for cost in commands],
     }  # fmt: skip
+
+
+def scene(size: tuple[int, int], seconds: float) -> Scenario:
+    """Load the scene that is driven, with one camera of a size."""
+    ref = expand(SUITE)[SCENE]
+    loaded = load_scenario(ref.path, ref.seed, [*ref.overrides, "cameras=[{{width: {}, height: {}}}]".format(*size)])
+    return replace(loaded, end_us=min(loaded.end_us, loaded.start_us + int(1e6 * seconds)))
 
 
 def reference_ms(times: int = 7) -> float:
@@ -134,6 +143,7 @@ def frame_cost(renderer: str, scenario: Scenario, repeats: int) -> FrameCost:
     clean = np.stack([truth.render(request).rgb for request in recording.requests])
     return FrameCost(
         renderer,
+        (clean.shape[2], clean.shape[1]),
         count,
         {stage: sum(fastest(drives, stage)) / count for stage in dict.fromkeys(name for drive in drives for name in drive)},
         psnr_db(np.stack([frame.rgb for frame in recording.frames]), clean),
@@ -184,7 +194,8 @@ def _frame_row(cost: FrameCost, reference: float) -> dict[str, Any]:
     odd = set(cost.ms) - set(STAGES)
     stages = {stage: cost.ms[stage] for stage in (*STAGES, *sorted(odd)) if stage in cost.ms}
     return {
-        "renderer": cost.renderer, "frames": cost.frames, "ms": cost.total_ms, "ratio": cost.total_ms / reference,
+        "renderer": cost.renderer, "size": "x".join(map(str, cost.size)), "frames": cost.frames,
+        "ms": cost.total_ms, "ratio": cost.total_ms / reference,
         "stages": {stage: {"ms": ms, "ratio": ms / reference} for stage, ms in stages.items()},
         "psnr_db": cost.psnr_db, "raster_levels": cost.raster_levels,
     }  # fmt: skip
@@ -196,7 +207,7 @@ def _command_row(cost: CommandCost, reference: float) -> dict[str, Any]:
 
 def markdown(record: Mapping[str, Any]) -> str:
     """Return the tables of a record, and the line that says where they come from."""
-    head = ["frame behind", "all, processor ms", "x reference", *STAGES, "PSNR, dB", "raster, levels"]
+    head = ["frame behind", "size", "all, processor ms", "x reference", *STAGES, "PSNR, dB", "raster, levels"]
     lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * (len(head) - 1)}"]
     for row in record["frames"]:
         stages = [f"{row['stages'][stage]['ms']:.1f}" if stage in row["stages"] else "" for stage in STAGES]
@@ -204,7 +215,7 @@ def markdown(record: Mapping[str, Any]) -> str:
             "equal" if row["psnr_db"] >= 100 else f"{row['psnr_db']:.1f}",
             "" if row["raster_levels"] is None else row["raster_levels"],
         ]
-        cells = [f"`{row['renderer']}`", f"{row['ms']:.1f}", f"{row['ratio']:.2f}", *stages, *error]
+        cells = [f"`{row['renderer']}`", row["size"], f"{row['ms']:.1f}", f"{row['ratio']:.2f}", *stages, *error]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += ["", "| command | processor, s | passed, s | x reference |", "|---|---:|---:|---:|"]
     lines += [f"| {row['command']} | {row['processor_s']:.2f} | {row['wall_s']:.2f} | {row['ratio']:.0f} |" for row in record["commands"]]

@@ -26,9 +26,11 @@ def test_the_reference_is_the_same_work_each_time() -> None:
 
 def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "COMMANDS", {"start": ("--version",)})
+    monkeypatch.setattr(module, "SIZES", ((128, 72), (64, 36)))
     record = bench_loop(["clean"], repeats=1, seconds=0.5)
     assert json.loads(json.dumps(record)) == record
-    (frame,), (start,) = record["frames"], record["commands"]
+    (frame, small), (start,) = record["frames"], record["commands"]
+    assert [frame["size"], small["size"]] == ["128x72", "64x36"]
     assert {"render", "policy", "control", "log"} <= set(frame["stages"]) <= set(STAGES)
     assert frame["ms"] == pytest.approx(sum(stage["ms"] for stage in frame["stages"].values()))
     assert frame["ratio"] == pytest.approx(frame["ms"] / record["reference_ms"])
@@ -37,7 +39,7 @@ def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(monkeyp
     assert frame["raster_levels"] <= 1
     rows = [line.split("|") for line in markdown(record).splitlines() if line.startswith("|")]
     assert {len(row) for row in rows[:3]} == {len(rows[0])}
-    assert [row[1].strip() for row in rows] == ["frame behind", "---", "`clean`", "command", "---", "start"]
+    assert [row[1].strip() for row in rows] == ["frame behind", "---", "`clean`", "`clean`", "command", "---", "start"]
 
 
 def test_the_page_holds_the_record_that_lies_beside_it() -> None:
