@@ -181,7 +181,7 @@ def _check_fixer_settings(settings: Sequence[str], names: Sequence[str], rendere
 def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
     """Load scenarios, with a note where the background is not as stated."""
     loaded: dict[str, tuple[ScenarioRef, Scenario]] = {}
-    for ref in refs:
+    for ref in dict.fromkeys(refs):  # what two suites list is driven once
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.scene_id in loaded:
             both = f"{ref.path} and {loaded[scenario.scene_id][0].path}"

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -195,8 +196,11 @@ def test_workers_times_threads_never_exceed_the_cores() -> None:
             assert wanted is not None or budget.workers * budget.per_worker <= max(cores, 1)
 
 
-def test_two_scenarios_with_one_id_are_refused() -> None:
-    refs = expand("smoke/straight") * 2
+def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_refused() -> None:
+    refs = [*expand("suites/smoke"), *expand("suites/hard")]  # both list hard/hard_brake
+    plan = make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
+    assert len(refs) == len(plan.cells) + 1
+    refs = [*expand("smoke/straight"), replace(expand("smoke/straight")[0], overrides=("timing.duration_us=2000000",))]
     with pytest.raises(InputError, match="both have the scene id"):
         make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
 
