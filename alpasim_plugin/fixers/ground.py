@@ -129,5 +129,5 @@ def _disagreement(a: U8, b: U8, size: int) -> I32:
     Whole numbers: their sum is the same in any order.
     """
     apart = cv2.transform(cv2.absdiff(a, b), GREY)
-    apart[(a[..., 3] == 0) | (b[..., 3] == 0)] = UNSEEN
+    apart[cv2.min(cv2.extractChannel(a, 3), cv2.extractChannel(b, 3)) == 0] = UNSEEN
     return np.asarray(cv2.boxFilter(apart, cv2.CV_32S, (size, size), normalize=False), np.int32)

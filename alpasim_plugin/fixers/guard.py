@@ -133,25 +133,34 @@ def _cells(x: Tensor) -> Tensor:
 def _keep_one(out: F32, render: F32, opacity: F32, sdmap: F32, before: F32, recorded: F32) -> Tensor | None:
     """Do what `keep_render` does for one image, `render_share` by OpenCV, which pools images whose channels come last six times as fast."""
     height, width, _ = out.shape
-    size, around = (width // CELL, height // CELL), np.ones((AROUND, AROUND), np.uint8)
+    around = np.ones((AROUND, AROUND), np.uint8)
 
     def means(image: F32) -> F32:
+        size = (width // CELL, len(image) // CELL)
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
     change = means(cv2.absdiff(out, render)).mean(axis=-1)
     if float(change.max()) <= LARGE[0]:
         return None
     share = _ramp(means(opacity), *OPAQUE) * _ramp(change, *LARGE)
-    share[cv2.dilate((means(sdmap).mean(axis=-1) + 1) / 2, around) > MAPPED] = 0
-    if not share.any():
+    rows = np.flatnonzero(share.any(axis=1))
+    if not len(rows):
         return None
-    now, past = means(out), means(before)
+    # Only these rows of cells can change, and nothing beyond those in reach of them is looked at.
+    first, last = max(rows[0] - REACH, 0), rows[-1] + REACH + 1
+    near, pixels = share[first:last], slice(CELL * first, CELL * last)
+    near[cv2.dilate((means(sdmap[pixels]).mean(axis=-1) + 1) / 2, around) > MAPPED] = 0
+    if not near.any():
+        return None
+    now, past = means(out[pixels]), means(before[pixels])
     above, below = now - cv2.dilate(past, around), cv2.erode(past, around) - now
-    share *= _ramp(np.maximum(above.max(axis=-1), 0) + np.maximum(below.max(axis=-1), 0), *(limit / 2 for limit in LARGE))
-    if not share.any():
+    near *= _ramp(np.maximum(above.max(axis=-1), 0) + np.maximum(below.max(axis=-1), 0), *(limit / 2 for limit in LARGE))
+    if not near.any():
         return None
-    weight = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))[..., None] * (1 - recorded)
-    return torch.from_numpy(out + weight * (render - out))
+    weight = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))[pixels, :, None] * (1 - recorded[pixels])
+    kept = out.copy()
+    kept[pixels] += weight * (render[pixels] - out[pixels])
+    return torch.from_numpy(kept)
 
 
 def _ramp(x: Ramped, low: float, high: float) -> Ramped:

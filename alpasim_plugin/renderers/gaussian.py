@@ -191,7 +191,7 @@ def in_memory(key: str, make: Callable[[], T]) -> T:
     """Return what is kept under a key in this process, made if it is not there; the least recently used goes first."""
     if key not in _cache:
         _cache[key] = make()
-        while len(_cache) > 2 * CACHED_SCENES:
+        while len(_cache) > 3 * CACHED_SCENES:  # a scene, its reconstruction and its recording
             _cache.popitem(last=False)
     _cache.move_to_end(key)
     return _cache[key]  # type: ignore[return-value]

@@ -74,8 +74,10 @@ class ReconstructionRenderer(Renderer):
         return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
 
     def recorded(self) -> Sequence[RecordedFrame]:
-        """Return what the scenario's cameras saw along the log, at the poses that the reconstruction believes."""
-        return built_recording(self.scenario, scene_of(self.scenario), self.model.graph.render, recipe_of(self.scenario))
+        """Return what the scenario's cameras saw along the log, at the believed poses; the drives of a process share what was read."""
+        recipe = recipe_of(self.scenario)
+        key = f"recording:{reconstruction_key(self.scenario, recipe)}"
+        return in_memory(key, lambda: built_recording(self.scenario, scene_of(self.scenario), self.model.graph.render, recipe))
 
 
 def reconstruction_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -29,6 +29,7 @@ DOING = "reading a recorded photograph"
 SIDE_PX = 16
 INTERVAL_US, FIRST_US = 500_000, 50_000  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
 POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
+KEPT_SHOTS = 48  # rendered pictures that a built scene's recording keeps: 50 MB of 512x288
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
 Model = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]  # renders a view of the reconstruction
@@ -50,8 +51,11 @@ class _Shot:
         return self.scene.render(self.true, self.actors, 1).to_uint8(), self.model(self.believed, self.actors).surface_depth()
 
 
+Read = Callable[[_Shot], tuple[U8, F32]]
+
+
 def built_recording(scenario: Scenario, scene: SceneGraph, model: Model, recipe: ReconstructionRecipe | None) -> tuple[RecordedFrame, ...]:
-    """Return the recording of a built scene; a frame is rendered when it is read.
+    """Return the recording of a built scene; a frame is rendered when it is first read, and kept as a file would be.
 
     Args:
         scenario: Its log, cameras and actors.
@@ -68,8 +72,9 @@ def built_recording(scenario: Scenario, scene: SceneGraph, model: Model, recipe:
         errors = pose_errors(scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, recipe.splat.views, at)
     aside = np.eye(4)
     aside[1, 3] = recipe.aside_m if recipe else 0.0
+    read = lru_cache(maxsize=KEPT_SHOTS)(_Shot.read)
     return tuple(
-        _frame(scenario, scene, model, spec, t_us, interpolate(log, t_us) @ aside @ spec.T_rig_camera, error)
+        _frame(scenario, scene, model, read, spec, t_us, interpolate(log, t_us) @ aside @ spec.T_rig_camera, error)
         for t_us, error in zip(times, errors, strict=True)
         for spec in scenario.cameras
     )
@@ -93,13 +98,13 @@ def pose_errors(scene_id: str, seed: int, spread_m: float, views: int, at: F64) 
 
 
 def _frame(
-    scenario: Scenario, scene: SceneGraph, model: Model, spec: CameraSpec, t_us: int, T_world_camera: F64, error: F64
+    scenario: Scenario, scene: SceneGraph, model: Model, read: Read, spec: CameraSpec, t_us: int, T_world_camera: F64, error: F64
 ) -> RecordedFrame:
     true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
     T_world_believed = inverse(error @ true.T_camera_world)
     believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
     actors = dict(log_actors(scenario, t_us))
-    return RecordedFrame(t_us, spec.name, spec.K, T_world_believed, actors, _Shot(scene, model, true, believed, actors).read)
+    return RecordedFrame(t_us, spec.name, spec.K, T_world_believed, actors, partial(read, _Shot(scene, model, true, believed, actors)))
 
 
 def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[RecordedFrame, ...]:

@@ -7,6 +7,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud
+from alpasim_plugin.gaussians.cloud import FEW, all_rigid, require_rigid
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 
 
@@ -135,3 +136,22 @@ def test_arrays_of_a_cloud_cannot_be_written_and_those_given_stay_writable():
     with pytest.raises(ValueError, match="read-only"):
         cloud.means[0] = 0.0
     data["means"][0] = 0.0
+
+
+@pytest.mark.parametrize("entry", [(0, 0), (1, 2), (2, 1), (3, 1), (3, 3)])
+@pytest.mark.parametrize("by", [3e-6, -3e-5, 0.1, np.nan])
+def test_one_transform_is_rigid_where_many_are(entry: tuple[int, int], by: float) -> None:
+    T = random_rigid(7)
+    T[entry] += by
+    many = np.stack([T, *[np.eye(4)] * FEW])
+    assert all_rigid(T[None]) == all_rigid(many)
+    if all_rigid(many):
+        require_rigid(T, "testing")
+    else:
+        with pytest.raises(InputError):
+            require_rigid(T, "testing")
+    mirrored, far = random_rigid(7), random_rigid(7)
+    mirrored[:3, 0] *= -1
+    far[0, 3] = np.inf
+    assert not all_rigid(mirrored[None])
+    assert not all_rigid(far[None])

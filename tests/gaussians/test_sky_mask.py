@@ -1,10 +1,12 @@
 """Sky told from holes by what the logged views saw."""
 
+import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask
+from alpasim_plugin.gaussians.scene.sky import STEP_PX, _upsample
 
 
 def camera(width: int, height: int, yaw_rad: float = 0.0, x_m: float = 0.0) -> PinholeCamera:
@@ -44,3 +46,11 @@ def test_nearest_view_that_looks_the_same_way_is_taken() -> None:
 
 def test_without_views_nothing_is_sky() -> None:
     assert SkyMask([]).share(camera(8, 4)).max() == 0.0
+
+
+def test_directions_between_corners_are_those_at_the_middles_of_pixels() -> None:
+    height, width = 2 * STEP_PX + 3, 3 * STEP_PX + 5
+    grid = np.random.default_rng(0).uniform(-1e3, 1e3, (4, 5))
+    rows, columns = np.indices((height, width), dtype=np.float32)
+    plain = cv2.remap(grid.astype(np.float32), (columns + 0.5) / STEP_PX, (rows + 0.5) / STEP_PX, cv2.INTER_LINEAR)
+    np.testing.assert_allclose(_upsample(grid, height, width), plain, rtol=1e-6, atol=2e-4)

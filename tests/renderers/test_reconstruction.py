@@ -95,6 +95,13 @@ def test_frames_do_not_depend_on_what_came_before_nor_on_threads(fitted: Reconst
         np.testing.assert_array_equal(first.alpha, again.alpha)
 
 
+def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(fitted: ReconstructionRenderer) -> None:
+    (first, other), again = (make_renderer("3dgs", fitted.scenario).recorded()[:2] for _ in range(2))
+    assert (first, other) == tuple(again)
+    assert again[0].read() is first.read()
+    assert other.read() is not first.read()
+
+
 def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(fitted: ReconstructionRenderer) -> None:
     actors = fitted.model.graph.actors
     assert len(actors["ahead"].levels) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -39,7 +40,7 @@ class RasterOutput:
 
     def surface_depth(self) -> F32:
         """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the background shows through."""
-        return np.where(self.alpha >= 0.5, self.depth, np.float32(0))
+        return np.asarray(cv2.copyTo(self.depth, cv2.compare(self.alpha, 0.5, cv2.CMP_GE)), np.float32)
 
     def to_uint8(self) -> npt.NDArray[np.uint8]:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""

@@ -128,6 +128,17 @@ def load(typingctx, array, index):
 
 
 @intrinsic
+def load_bytes(typingctx, array, index):
+    """Return sixteen consecutive uint8 of a one-dimensional contiguous array as float32, without bounds check."""
+
+    def codegen(context, builder, sig, args):
+        pointer = _element_pointer(context, builder, sig.args[0], args[0], args[1], ir.VectorType(ir.IntType(8), LANES))
+        return builder.uitofp(builder.load(pointer, align=1), _VECTORS["f32"])
+
+    return F32X16(array, types.intp), codegen
+
+
+@intrinsic
 def _pointer(typingctx, address, dtype):
     def codegen(context, builder, sig, args):
         return builder.inttoptr(args[0], context.get_value_type(sig.return_type))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -68,14 +67,10 @@ def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
 
 def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
     """Interpolate values at every `STEP_PX`-th pixel corner to pixel centres."""
-    return np.asarray(cv2.remap(grid.astype(np.float32), *_pixel_centres(height, width), cv2.INTER_LINEAR))
-
-
-@lru_cache(maxsize=8)
-def _pixel_centres(height: int, width: int) -> tuple[F32, F32]:
-    """Return column and row ``(height, width)`` of every pixel's centre on the grid of `_upsample`."""
-    rows, columns = np.indices((height, width), dtype=np.float32)
-    return (columns + np.float32(0.5)) / np.float32(STEP_PX), (rows + np.float32(0.5)) / np.float32(STEP_PX)
+    rows, columns = grid.shape
+    finer = cv2.resize(grid.astype(np.float32), (STEP_PX * columns, STEP_PX * rows), interpolation=cv2.INTER_LINEAR)
+    first = STEP_PX // 2  # it takes the values for those of the middles of squares
+    return np.asarray(finer[first : first + height, first : first + width])
 
 
 def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
