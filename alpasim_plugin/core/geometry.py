@@ -188,16 +188,25 @@ def offset_trajectory(trajectory: Trajectory, T_body_other: F64) -> Trajectory:
 
 def arc_lengths(line: F64) -> F64:
     """Return the cumulative length ``(N,)`` along the xy projection of a polyline ``(N, 2+)``."""
-    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    step = line[1:, :2] - line[:-1, :2]
+    step *= step
+    s = np.zeros(len(step) + 1)
+    np.cumsum(np.sqrt(step[:, 0] + step[:, 1]), out=s[1:])
+    return s
 
 
-def resample(line: F64, s_m: npt.ArrayLike) -> F64:
-    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its ends."""
-    s = arc_lengths(line)
-    keep = np.concatenate([[True], np.diff(s) > 0])
+def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
+    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its ends; ``along`` are its `arc_lengths`."""
+    s = arc_lengths(line) if along is None else along
+    rises = s[1:] > s[:-1]
+    if not rises.all():
+        keep = np.concatenate([[True], rises])
+        s, line = s[keep], line[keep]
     at = np.asarray(s_m, dtype=np.float64)
-    return np.stack([np.interp(at, s[keep], line[keep, d]) for d in range(line.shape[1])], axis=-1)
+    out = np.empty((*at.shape, line.shape[1]))
+    for d in range(line.shape[1]):
+        out[..., d] = np.interp(at, s, line[:, d])
+    return out
 
 
 class CubicSpline:
@@ -231,18 +240,18 @@ class CubicSpline:
             tangent = scipy.linalg.lapack.dgtsv(below, diagonal, above, right)[3]
         bend = (tangent[:-1] + tangent[1:] - 2 * slope) / over
         self._at = at
-        self._terms = points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over  # (N - 1, D) each
+        self._terms = np.stack([points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over])  # (4, N - 1, D)
 
     def __call__(self, at: F64, derivative: int = 0) -> F64:
         """Return points ``(M, D)``, or their first or second derivative, at ``(M,)``; outside, those of the outermost piece."""
-        i = np.clip(np.searchsorted(self._at, at, side="right") - 1, 0, len(self._at) - 2)
+        i = np.minimum(np.maximum(np.searchsorted(self._at, at, side="right") - 1, 0), len(self._at) - 2)
         along = (at - self._at[i])[:, None]
-        total, power = np.zeros((len(at), self._terms[0].shape[1])), np.ones_like(along)
-        for k, term in enumerate(self._terms):
-            if k >= derivative:
-                total = total + term[i] * power * float(math.perm(k, derivative))
-                power = power * along
-        return total
+        terms, power = self._terms[derivative:, i], along
+        total = terms[0] * float(math.factorial(derivative))
+        for k, term in enumerate(terms[1:], derivative + 1):
+            total += term * power * float(math.perm(k, derivative))
+            power = power * along
+        return np.asarray(total)
 
 
 def project(line: F64, xy: F64) -> tuple[float, float]:
