@@ -106,20 +106,21 @@ class Path:
     curvature: F64  # (N,) 1/m, left positive
 
 
-def has_route(route_rig: F64) -> bool:
-    """Return whether at least half a metre of the route ``(20, 3)`` is left."""
-    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
-    return len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5
-
-
-def route_points(route_rig: F64) -> F64:
-    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where no route is left.
+def route_left(route_rig: F64) -> F64 | None:
+    """Return the points ``(M, 2)`` of the route ``(20, 3)`` before its NaN rows; None where less than half a metre of it is left.
 
     The route begins at the ego's projection, so the first point may lie beside the ego.
     """
-    points = np.asarray(route_rig[np.isfinite(route_rig).all(axis=1), :2])
-    if has_route(route_rig):
-        return points
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    return points if len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5 else None
+
+
+def route_points(route_rig: F64) -> F64:
+    """Return the points of `route_left`; straight ahead where no route is left."""
+    left = route_left(route_rig)
+    if left is not None:
+        return left
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
     start = points[0] if len(points) else np.zeros(2)
     return np.stack([start, start + np.array([1.0, 0.0])])
 
@@ -146,9 +147,8 @@ def gradient(values: F64) -> F64:
     return out
 
 
-def headings(line: F64) -> F64:
-    """Return the heading ``(N,)`` along a line ``(N, 2)`` without jumps of a whole turn."""
-    step = gradient(line)
+def headings(step: F64) -> F64:
+    """Return the headings ``(N,)`` of steps ``(N, 2)`` along a line, without jumps of a whole turn."""
     heading = np.arctan2(step[:, 1], step[:, 0])
     jumps = np.abs(heading[1:] - heading[:-1]) >= np.pi
     return np.unwrap(heading) if jumps.any() else np.asarray(heading)
@@ -176,7 +176,7 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
         speed_mps: At which it will be driven.
     """
     xy = extended(points, length_m)
-    heading = headings(xy)
+    heading = headings(gradient(xy))
     half = round(max(5.0, SMOOTH_S * speed_mps) / Path.SPACING_M / 2)
     kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
     padded = np.concatenate([np.full(half, heading[0]), heading, np.full(half, heading[-1])])

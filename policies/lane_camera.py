@@ -20,9 +20,8 @@ from policies.base import (
     follow,
     front_camera,
     gradient,
-    has_route,
     plan_times,
-    route_points,
+    route_left,
     seconds,
     shifted,
     smooth_line,
@@ -98,8 +97,9 @@ class LaneCamera(Policy):
         """
         frame = camera_frame(observation, self.camera, "lane-camera")
         route = None
-        if has_route(observation.route_rig):  # with a lateral navigation error that is constant over the drive
-            line = smooth_line(route_points(observation.route_rig))
+        left = route_left(observation.route_rig)
+        if left is not None:  # with a lateral navigation error that is constant over the drive
+            line = smooth_line(left)
             step = gradient(line)
             normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
             route = line + self.navigation_error_m * normal
@@ -185,7 +185,7 @@ class LaneCamera(Policy):
     def _is_lost(self, lane: LaneState, route: RoutePrior | None) -> bool:
         if route is not None:
             at = 6.0
-            turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(np.array([at]))[0])
+            turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(at))
             if abs(turn) > TURN_OFF_RAD:
                 return True
             # Beside the route, a lane needs both borders: a single line is ambiguous.

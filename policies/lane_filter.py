@@ -51,10 +51,10 @@ class LaneState:
         beyond = np.maximum(x_m - self.seen_to_m, 0.0)
         return np.asarray(np.sqrt(np.maximum(var, 0.0) + (SHAPE_ERROR_1PM * x_m**2) ** 2 + (0.06 * beyond) ** 2))
 
-    def slope(self, x_m: F64) -> F64:
-        """Return dy/dx (K,) of the centre."""
-        _, heading, curvature, bend, _ = self.mean
-        return np.asarray(heading + curvature * x_m + 0.5 * bend * x_m**2)
+    def slope(self, x_m: F64 | float) -> F64:
+        """Return dy/dx (K,) of the centre, or () at one distance."""
+        _, heading, curvature, bend, _ = self.mean.tolist()
+        return np.asarray(heading + curvature * x_m + 0.5 * bend * (x_m * x_m))
 
 
 def start(offset_m: float, heading_rad: float, curvature_1pm: float, width_m: float = MEAN_WIDTH_M) -> LaneState:
@@ -113,7 +113,7 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     rows = row_m[near]
     left, right = _length(x, rows, used & (side > 0)), _length(x, rows, used & (side < 0))
     seen = left + right > 2.0
-    far = float(np.quantile(x[used], 0.95)) if seen else lane.seen_to_m
+    far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
     return LaneState(mean, np.asarray(np.linalg.inv(total)), left, right, max(far, 0.0), 0.0 if seen else lane.blind_m)
 
 
@@ -176,9 +176,10 @@ def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:
     centre = basis @ mean[:4]
     slope = mean[HEADING] + mean[CURVATURE] * x + 0.5 * mean[BEND] * x**2
     stretch = np.sqrt(1 + slope**2)  # the width is measured across the lane, not across the rig
-    side = np.where(y >= centre, 1.0, -1.0)
+    away = y - centre
+    side = np.copysign(1.0, away)
     half = 0.5 * side * stretch
-    return y - centre - half * mean[WIDTH], half, side
+    return away - half * mean[WIDTH], half, side
 
 
 def _length(x: F64, rows: F64, used: Bool) -> float:

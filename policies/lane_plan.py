@@ -84,9 +84,10 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
         return np.stack([x, y], axis=1), 0.0, np.inf
     s = arc_lengths(route)
     points = resample(route, np.arange(0.0, max(float(s[-1]), 2.0), 1.0), s)
-    heading = headings(points)
+    step = gradient(points)
+    heading = headings(step)
     x, y = points[:, 0], points[:, 1]
-    usable = _prefix((np.abs(heading) < 1.0) & (gradient(x) > 0.3) & (x > -5.0))
+    usable = _prefix((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))
     y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))
     sigma = lane.sigma(np.maximum(x, 0.0))
     apart = np.abs((y - y_lane) - (y[0] - y_lane[0])) > LEAVE_M
@@ -119,20 +120,18 @@ def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrac
     ahead = limits.tolist()
     end, cruise = len(ahead) - 1, max(float(cruise_mps), 0.1)
     progress, s, v = [0.0], 0.0, max(float(speed_mps), 0.0)
+    other_m, other = (math.inf, 0.0) if obstacle is None else (float(obstacle.distance_m), max(float(obstacle.speed_mps), 0.0))
     for t, dt in zip(t_s.tolist(), np.diff(t_s).tolist(), strict=False):
         at = int(s / Path.SPACING_M)
         limit = ahead[at if at < end else end]
         accel = IDM_ACCEL_MPS2 * (1 - (v / cruise) ** 4) if v < limit else (limit - v) / 0.5
         accel = max(min(accel, (limit - v) / dt), -4.0)
         if obstacle is not None:
-            other = max(obstacle.speed_mps, 0.0)
-            gap = obstacle.distance_m + other * t - s - bumper_m
+            gap = other_m + other * t - s - bumper_m
             wish = MIN_GAP_M + max(v * HEADWAY_S + v * (v - other) / IDM_TWICE_MPS2, 0.0)
             follow = IDM_ACCEL_MPS2 * (1 - (v / max(limit, 0.1)) ** 4 - (wish / max(gap, 0.1)) ** 2)
             accel = max(min(accel, follow), -HARD_BRAKE_MPS2)
-        after = v + accel * dt
-        if after < 0.0:
-            after = 0.0
+        after = max(v + accel * dt, 0.0)
         s += 0.5 * (v + after) * dt
         v = after
         progress.append(s)
@@ -174,7 +173,7 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
         sigma_m: From `sample_sigma_m`.
     """
     s = arc_lengths(xy)
-    ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
+    ramp = np.minimum(s / NOISE_RAMP_M, 1.0)
     ramp_slope = np.where(s < NOISE_RAMP_M, 6 * ramp * (1 - ramp) / NOISE_RAMP_M, 0.0)
     ramp = ramp * ramp * (3 - 2 * ramp)
     ahead = np.arange(len(s)) / DRIFT_STEPS

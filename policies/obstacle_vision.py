@@ -50,19 +50,25 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
     if len(rows) < 3:
         return colour
     columns = grid.column_of(centre_y[rows])[:, None] + np.arange(-ROAD_HALF_M, ROAD_HALF_M, 2 * CELL_M) / CELL_M
-    index = np.clip(np.rint(columns).astype(np.intp), 0, lab.shape[1] - 1)
+    index = np.minimum(np.maximum(np.rint(columns).astype(np.intp), 0), lab.shape[1] - 1)
     patch = lab[rows[:, None], index].reshape(-1, 3).astype(np.float64)
     patch = patch[grid.inside[rows[:, None], index].reshape(-1)]
     if len(patch) < 50:
         return colour
-    middle = np.median(patch, axis=0)
-    spread = 1.4826 * np.median(np.abs(patch - middle), axis=0)
+    middle = _median(patch)
+    spread = 1.4826 * _median(np.abs(patch - middle))
     new = RoadColour(middle, np.maximum(np.array([22.0, 7.0, 7.0]), 4.0 * spread))
     if colour is None:
         return new
     # A sudden change is more likely an obstacle than a new road surface: adapt slowly.
     step = np.clip(new.centre - colour.centre, -20.0, 20.0)
     return RoadColour(colour.centre + LEARN * step, colour.tolerance + LEARN * (new.tolerance - colour.tolerance))
+
+
+def _median(rows: F64) -> F64:
+    """Return the median ``(D,)`` of rows ``(N, D)``: `numpy.median` of few columns, in a third of its time."""
+    columns, n = np.sort(rows.T), len(rows)
+    return np.asarray((columns[:, (n - 1) // 2] + columns[:, n // 2]) / 2.0)
 
 
 def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
@@ -135,7 +141,8 @@ def _sums_along_sight(value: U8, width_m: float, grid: GroundGrid) -> F64:
     """Return the integral image ``(R + 1, U + 1)``, over grid rows and image columns, of the anomaly in 0..1 that is at least so wide."""
     bar = np.ones((1, round(width_m / CELL_M) | 1), dtype=np.uint8)
     seen = np.take(cv2.morphologyEx(value, cv2.MORPH_OPEN, bar), grid.sight_index)
-    return np.asarray(cv2.integral(seen, sdepth=cv2.CV_64F) / 255.0, dtype=np.float64)
+    table = cv2.integral(seen, sdepth=cv2.CV_64F)
+    return np.asarray(np.divide(table, 255.0, out=table))
 
 
 def _box_mean(table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp], u: npt.NDArray[np.intp]) -> F64:

@@ -151,8 +151,8 @@ class RidgeFilter:
             # Means of all flanks of a row by the column they begin at; that to the right of a cell is that to the left of one further on.
             flanks = _means(total[rows], flank + 1)
             centre = _means(total[rows, reach - half : n - reach + half + 1], 2 * half + 1)
-            contrast = centre - np.maximum(flanks[:, : n - 2 * reach], flanks[:, reach + gap :])
-            np.maximum(contrast, 0.0, out=out[rows, reach : n - reach])
+            np.subtract(centre, np.maximum(flanks[:, : n - 2 * reach], flanks[:, reach + gap :]), out=out[rows, reach : n - reach])
+        np.maximum(out, 0.0, out=out)
         out *= self._seen
         return out
 
@@ -162,7 +162,7 @@ class RidgeFilter:
         gap, beside = self._gap[rows], self._beside[rows]
 
         def mean(first: npt.NDArray[np.intp], last: npt.NDArray[np.intp]) -> F32:
-            a, b = np.clip(first, 0, n), np.clip(last + 1, 0, n)
+            a, b = np.minimum(np.maximum(first, 0), n), np.minimum(np.maximum(last + 1, 0), n)
             return np.asarray((total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(np.float32))
 
         return np.asarray(np.maximum(mean(columns - gap - beside, columns - gap), mean(columns + gap, columns + gap + beside)))
@@ -201,7 +201,7 @@ def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 |
     rows, cols = rows[inner], cols[inner]
     before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
     bend = np.maximum(2 * here - before - after, 1e-6)
-    shift = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
+    shift = np.minimum(np.maximum(0.5 * (after - before) / bend, -0.5), 0.5)
     y = np.asarray(grid.y_m[cols] - shift * CELL_M)
     strength = here / threshold[rows]
     # A bar of a crosswalk has at least two others beside it, closer than a lane width.

@@ -283,7 +283,7 @@ def test_what_is_computed_without_numpys_overhead_is_equal_to_the_bit(seed: int,
     step = np.gradient(line, axis=0)
     assert np.array_equal(gradient(line), step)
     assert np.array_equal(gradient(line[:, 0]), np.gradient(line[:, 0]))
-    assert np.array_equal(headings(line), np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+    assert np.array_equal(headings(step), np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
     assert np.array_equal(arc_lengths(line), np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]))
     (x, y), start = random.normal(0.0, 5.0, 2), int(random.integers(points))
     distance = (line[:, 0] - x) ** 2 + (line[:, 1] - y) ** 2
