@@ -174,9 +174,10 @@ class AslWriter:
         entry = logging_pb2.LogEntry(
             driver_return=message(trajectory=common_pb2.Trajectory(), debug_info=message.DebugInfo(), terminate_session=terminate)
         )
-        entry.driver_return.trajectory.MergeFromString(wire_bytes(plan, "the driver's plan"))
-        for sample in samples:
-            entry.driver_return.debug_info.sampled_trajectories.add().MergeFromString(wire_bytes(sample, "a sampled plan"))
+        first, *others = wire_bytes([plan, *samples], "the driver's plan and its samples")
+        entry.driver_return.trajectory.MergeFromString(first)
+        for other in others:
+            entry.driver_return.debug_info.sampled_trajectories.add().MergeFromString(other)
         self._file.write(entry)
 
     def controller_request(self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False) -> None:
@@ -203,7 +204,7 @@ class AslWriter:
                 pose_reporting_interval_us=self.header.control_us,
             )
         )
-        entry.controller_request.planned_trajectory_in_rig.MergeFromString(wire_bytes(plan, "the active plan"))
+        entry.controller_request.planned_trajectory_in_rig.MergeFromString(wire_bytes([plan], "the active plan")[0])
         self._file.write(entry)
 
     def controller_return(self, state: EgoState) -> None:
