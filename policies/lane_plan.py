@@ -46,7 +46,10 @@ def route_prior(points: F64) -> RoutePrior:
     x, y = near[:, 0], near[:, 1]
     if x[-1] - x[0] < 5.0:
         return RoutePrior(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
-    half_curvature, heading, offset = np.polyfit(x, y, 2)
+    powers = np.ones((len(x), 3))  # `numpy.polyfit`, to the bit, without its checks
+    powers[:, 0], powers[:, 1] = x * x, x
+    scale = np.sqrt((powers * powers).sum(axis=0))
+    half_curvature, heading, offset = np.linalg.lstsq(powers / scale, y, len(x) * np.finfo(np.float64).eps)[0] / scale
     return RoutePrior(float(offset), float(heading), float(2 * half_curvature))
 
 

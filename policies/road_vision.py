@@ -111,7 +111,7 @@ MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double 
 
 @dataclass(frozen=True)
 class PaintPoints:
-    """Where paint was seen: one entry per line and grid row."""
+    """Where paint was seen: one entry per line and grid row, the nearest rows first."""
 
     x_m: F64  # (N,) rig
     y_m: F64  # (N,)
