@@ -296,9 +296,9 @@ def _project_ahead(line: F64, along: F64, xy: F64, yaw: float) -> float:
 
 def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
     """Return the segments ``(S, 2)`` of a polyline, the share of each at which it is nearest to a point, and the offsets there."""
-    start, step = line[:-1, :2], np.diff(line[:, :2], axis=0)
+    start, step = line[:-1, :2], line[1:, :2] - line[:-1, :2]
     length2 = np.maximum(np.sum(step * step, axis=1), 1e-300)
-    share = np.clip(np.sum((xy - start) * step, axis=1) / length2, 0.0, 1.0)
+    share = np.minimum(np.maximum(np.sum((xy - start) * step, axis=1) / length2, 0.0), 1.0)
     return step, share, xy - (start + share[:, None] * step)
 
 
