@@ -106,20 +106,21 @@ class Path:
     curvature: F64  # (N,) 1/m, left positive
 
 
-def has_route(route_rig: F64) -> bool:
-    """Return whether at least half a metre of the route ``(20, 3)`` is left."""
-    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
-    return len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5
-
-
-def route_points(route_rig: F64) -> F64:
-    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where no route is left.
+def route_left(route_rig: F64) -> F64 | None:
+    """Return the points ``(M, 2)`` of the route ``(20, 3)`` before its NaN rows; None where less than half a metre of it is left.
 
     The route begins at the ego's projection, so the first point may lie beside the ego.
     """
-    points = np.asarray(route_rig[np.isfinite(route_rig).all(axis=1), :2])
-    if has_route(route_rig):
-        return points
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    return points if len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5 else None
+
+
+def route_points(route_rig: F64) -> F64:
+    """Return the points of `route_left`; straight ahead where no route is left."""
+    left = route_left(route_rig)
+    if left is not None:
+        return left
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
     start = points[0] if len(points) else np.zeros(2)
     return np.stack([start, start + np.array([1.0, 0.0])])
 
@@ -130,11 +131,37 @@ def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
     A route comes as points 4.2 m apart; on a bend of 10 m radius its polyline runs 0.2 m inside the road.
     """
     s = arc_lengths(points)
-    keep = np.concatenate([[True], np.diff(s) > 1e-6])
+    keep = np.concatenate([[True], s[1:] - s[:-1] > 1e-6])
     at = np.arange(0.0, max(float(s[-1]), spacing_m) + 1e-9, spacing_m)
     if keep.sum() < 3:
-        return resample(points, at)
+        return resample(points, at, s)
     return CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1]))
+
+
+def gradient(values: F64) -> F64:
+    """Return the differences ``(N, ...)`` of values one apart, central and at the ends one-sided: `numpy.gradient` without its overhead."""
+    out = np.empty_like(values)
+    np.subtract(values[2:], values[:-2], out=out[1:-1])
+    out[1:-1] /= 2.0
+    out[0], out[-1] = values[1] - values[0], values[-1] - values[-2]
+    return out
+
+
+def headings(step: F64) -> F64:
+    """Return the headings ``(N,)`` of steps ``(N, 2)`` along a line, without jumps of a whole turn."""
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    jumps = np.abs(heading[1:] - heading[:-1]) >= np.pi
+    return np.unwrap(heading) if jumps.any() else np.asarray(heading)
+
+
+def extended(points: F64, length_m: float) -> F64:
+    """Return a line through points ``(M, 2)``, one every `Path.SPACING_M`, that goes straight on up to ``length_m``."""
+    s = arc_lengths(points)
+    tail = points[-1] - resample(points, [max(s[-1] - 5.0, 0.0)], s)[0]
+    tail = tail / max(float(np.hypot(*tail)), 1e-9)
+    missing = max(length_m - s[-1], 1.0)
+    line = np.concatenate([points, (points[-1] + missing * tail)[None]])
+    return resample(line, np.arange(0.0, s[-1] + missing, Path.SPACING_M))
 
 
 def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> Path:
@@ -148,24 +175,17 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
         length_m: Shortest length of the result.
         speed_mps: At which it will be driven.
     """
-    s = arc_lengths(points)
-    tail = points[-1] - resample(points, [max(s[-1] - 5.0, 0.0)])[0]
-    tail = tail / max(float(np.hypot(*tail)), 1e-9)
-    missing = max(length_m - s[-1], 1.0)
-    line = np.concatenate([points, (points[-1] + missing * tail)[None]])
-    at = np.arange(0.0, s[-1] + missing, Path.SPACING_M)
-    xy = resample(line, at)
-    step = np.gradient(xy, Path.SPACING_M, axis=0)
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    xy = extended(points, length_m)
+    heading = headings(gradient(xy))
     half = round(max(5.0, SMOOTH_S * speed_mps) / Path.SPACING_M / 2)
     kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
-    smooth = np.convolve(np.pad(heading, half, mode="edge"), kernel, mode="valid")
-    return Path(xy, np.gradient(smooth, Path.SPACING_M))
+    padded = np.concatenate([np.full(half, heading[0]), heading, np.full(half, heading[-1])])
+    return Path(xy, gradient(np.convolve(padded, kernel, mode="valid")) / Path.SPACING_M)
 
 
 def shifted(line: F64, left_m: float) -> F64:
     """Return a line ``(M, 2)`` shifted to the left."""
-    step = np.gradient(line, axis=0)
+    step = gradient(line)
     normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
     return np.asarray(line + left_m * normal)
 
@@ -204,14 +224,13 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
     tightest = float(np.abs(path.curvature[: round(15.0 / Path.SPACING_M)]).max())
     lookahead = min(lookahead, max((8 * CUT_M / max(tightest, 1e-6)) ** 0.5, MIN_LOOKAHEAD_M))
     limit = min(MAX_CURVATURE_1PM, MAX_PURSUIT_MPS2 / max(speed_mps**2, 1.0))
-    xs, ys = path.xy[:, 0].tolist(), path.xy[:, 1].tolist()
+    points = path.xy.tolist()
     x = y = yaw = 0.0
-    out = np.zeros((len(progress), 3))
+    out = [(x, y, yaw)]
     nearest = 0
-    moves = np.diff(progress).tolist()
-    for k, ds in enumerate(moves):
-        nearest, target = _targets(xs, ys, x, y, nearest, lookahead)
-        dx, dy = xs[target] - x, ys[target] - y
+    for ds in np.diff(progress).tolist():
+        nearest, target = _targets(points, x, y, nearest, lookahead * lookahead)
+        dx, dy = points[target][0] - x, points[target][1] - y
         left = -math.sin(yaw) * dx + math.cos(yaw) * dy
         curvature = min(max(2 * left / max(dx * dx + dy * dy, 1e-6), -limit), limit)
         half = 0.5 * curvature * ds
@@ -219,19 +238,19 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
         x += chord * math.cos(yaw + half)
         y += chord * math.sin(yaw + half)
         yaw += 2 * half
-        out[k + 1] = x, y, yaw
-    return out[:, :2].copy(), out[:, 2].copy()
+        out.append((x, y, yaw))
+    poses = np.array(out)
+    return poses[:, :2].copy(), poses[:, 2].copy()
 
 
-def _targets(xs: list[float], ys: list[float], x: float, y: float, start: int, lookahead: float) -> tuple[int, int]:
-    """Return the index of the nearest point from ``start`` on, and of the first later point at least ``lookahead`` away."""
-    nearest, best = start, float("inf")
-    for i in range(start, min(start + 8, len(xs))):
-        d = (xs[i] - x) ** 2 + (ys[i] - y) ** 2
-        if d < best:
-            nearest, best = i, d
-    limit = lookahead * lookahead
-    for i in range(nearest, len(xs)):
-        if (xs[i] - x) ** 2 + (ys[i] - y) ** 2 >= limit:
-            return nearest, i
-    return nearest, len(xs) - 1
+def _targets(points: list[list[float]], x: float, y: float, start: int, far_m2: float) -> tuple[int, int]:
+    """Return the index of the nearest of eight points from ``start`` on, and of the first later point at least so far away, squared."""
+    near = [(dx := px - x) * dx + (dy := py - y) * dy for px, py in points[start : start + 8]]
+    nearest = near.index(min(near))
+    for i in range(nearest, len(near)):
+        if near[i] >= far_m2:
+            return start + nearest, start + i
+    for i in range(start + len(near), len(points)):
+        if (points[i][0] - x) ** 2 + (points[i][1] - y) ** 2 >= far_m2:
+            return start + nearest, i
+    return start + nearest, len(points) - 1

@@ -16,17 +16,30 @@ from policies.base import (
     Path,
     camera_frame,
     curve_speeds,
+    extended,
     follow,
     front_camera,
-    has_route,
+    gradient,
     plan_times,
-    route_points,
+    route_left,
     seconds,
     shifted,
     smooth_line,
 )
 from policies.lane_filter import LaneState, predict, search, shift, update
-from policies.lane_plan import NOISE_SPEED, Blend, RoutePrior, blend, correlated_noise, idm_progress, route_prior, sample_sigma_m, sampled
+from policies.lane_plan import (
+    NOISE_SPEED,
+    PATH_M,
+    Blend,
+    RoutePrior,
+    blend,
+    correlated_noise,
+    fuse,
+    idm_progress,
+    route_prior,
+    sample_sigma_m,
+    sampled,
+)
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
 from policies.road_vision import GroundGrid, PaintPoints, RidgeFilter, find_paint, make_grid
 
@@ -84,9 +97,10 @@ class LaneCamera(Policy):
         """
         frame = camera_frame(observation, self.camera, "lane-camera")
         route = None
-        if has_route(observation.route_rig):  # with a lateral navigation error that is constant over the drive
-            line = smooth_line(route_points(observation.route_rig))
-            step = np.gradient(line, axis=0)
+        left = route_left(observation.route_rig)
+        if left is not None:  # with a lateral navigation error that is constant over the drive
+            line = smooth_line(left)
+            step = gradient(line)
             normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
             route = line + self.navigation_error_m * normal
         speed = observation.ego.speed_mps
@@ -124,12 +138,12 @@ class LaneCamera(Policy):
         points, crosswalk = find_paint(ground, self.grid, self.ridges, not_road)
         there = None if route is None else _points_in(route, pose_now, pose)
         self._look_for_lane(points, there, speed)
-        path = blend(self.lane, there, speed).path
-        centre_y = np.interp(self.grid.x_m, *_increasing(path.xy))
+        path = extended(fuse(self.lane, there)[0], PATH_M)
+        centre_y = np.interp(self.grid.x_m, *_increasing(path))
         foot = None
         if not_road is not None:
             not_road[crosswalk] = 0
-            reach = min(OBSTACLE_RANGE_M, _range_of(path.xy))
+            reach = min(OBSTACLE_RANGE_M, _range_of(path))
             foot = find_foot(not_road, self.grid, centre_y, float(self.grid.x_m[0]), reach)
         self.obstacle = track_obstacle(self.obstacle, foot, speed, dt_s, float(self.grid.x_m[0]))
         free_m = self.obstacle.distance_m if self.obstacle is not None else np.inf
@@ -171,7 +185,7 @@ class LaneCamera(Policy):
     def _is_lost(self, lane: LaneState, route: RoutePrior | None) -> bool:
         if route is not None:
             at = 6.0
-            turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(np.array([at]))[0])
+            turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(at))
             if abs(turn) > TURN_OFF_RAD:
                 return True
             # Beside the route, a lane needs both borders: a single line is ambiguous.
@@ -228,7 +242,8 @@ def _points_in(points: F64, T_world_a: F64, T_world_b: F64) -> F64:
 def _increasing(points: F64) -> tuple[F64, F64]:
     """Return x and y of the leading points ``(M, 2)`` whose x increases, for interpolation over x."""
     x = points[:, 0]
-    stop = int(np.argmax(np.diff(x) <= 0.05)) + 1 if (np.diff(x) <= 0.05).any() else len(x)
+    back = x[1:] - x[:-1] <= 0.05
+    stop = int(np.argmax(back)) + 1 if back.any() else len(x)
     return x[:stop], points[:stop, 1]
 
 

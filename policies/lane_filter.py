@@ -51,10 +51,10 @@ class LaneState:
         beyond = np.maximum(x_m - self.seen_to_m, 0.0)
         return np.asarray(np.sqrt(np.maximum(var, 0.0) + (SHAPE_ERROR_1PM * x_m**2) ** 2 + (0.06 * beyond) ** 2))
 
-    def slope(self, x_m: F64) -> F64:
-        """Return dy/dx (K,) of the centre."""
-        _, heading, curvature, bend, _ = self.mean
-        return np.asarray(heading + curvature * x_m + 0.5 * bend * x_m**2)
+    def slope(self, x_m: F64 | float) -> F64:
+        """Return dy/dx (K,) of the centre, or () at one distance."""
+        _, heading, curvature, bend, _ = self.mean.tolist()
+        return np.asarray(heading + curvature * x_m + 0.5 * bend * (x_m * x_m))
 
 
 def start(offset_m: float, heading_rad: float, curvature_1pm: float, width_m: float = MEAN_WIDTH_M) -> LaneState:
@@ -95,10 +95,12 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
         return lane
     var = CORRELATION * (points.sigma_m[near] ** 2 + (SHAPE_ERROR_1PM * x**2) ** 2)
     basis = _basis(x)
+    jacobian = np.empty((len(x), 5))
+    jacobian[:, :4] = basis
     information = np.linalg.inv(lane.cov)
     mean = lane.mean
     for iteration in range(ITERATIONS):
-        residual, jacobian, side = _residuals(mean, x, y, basis)
+        residual, jacobian[:, WIDTH], _ = _residuals(mean, x, y, basis)
         gate = GATE_M[0] + (GATE_M[1] - GATE_M[0]) / (1 + iteration)
         spread = 0.1 + np.sqrt(var / CORRELATION)
         weight = np.where(np.abs(residual) < gate, 1.0 / (1.0 + (residual / spread) ** 2), 0.0) / var
@@ -111,7 +113,7 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     rows = row_m[near]
     left, right = _length(x, rows, used & (side > 0)), _length(x, rows, used & (side < 0))
     seen = left + right > 2.0
-    far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
+    far = _percentile_95(x[used]) if seen else lane.seen_to_m
     return LaneState(mean, np.asarray(np.linalg.inv(total)), left, right, max(far, 0.0), 0.0 if seen else lane.blind_m)
 
 
@@ -170,20 +172,33 @@ def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float,
 
 
 def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:
-    """Return residual (N,), jacobian (N, 5) and side (N,) of the points against the nearer border."""
+    """Return residual (N,), its derivative by the width (N,), and side (N,) of the points against the nearer border."""
     centre = basis @ mean[:4]
     slope = mean[HEADING] + mean[CURVATURE] * x + 0.5 * mean[BEND] * x**2
     stretch = np.sqrt(1 + slope**2)  # the width is measured across the lane, not across the rig
-    side = np.where(y >= centre, 1.0, -1.0)
+    away = y - centre
+    side = np.copysign(1.0, away)
     half = 0.5 * side * stretch
-    return y - centre - half * mean[WIDTH], np.column_stack([basis, half]), side
+    return away - half * mean[WIDTH], half, side
 
 
 def _length(x: F64, rows: F64, used: Bool) -> float:
     """Return the metres of road over which at least one used point lies."""
-    _, first = np.unique(x[used], return_index=True)
-    return float(rows[used][first].sum())
+    at = x[used]
+    is_new = np.ones(len(at), dtype=bool)
+    np.not_equal(at[1:], at[:-1], out=is_new[1:])
+    return float(rows[used][is_new].sum())
+
+
+def _percentile_95(x: F64) -> float:
+    """Return what `numpy.percentile` does of increasing values, to the bit and in a twentieth of its time."""
+    at = (len(x) - 1) * 0.95
+    low, share = int(at), at - int(at)
+    a, b = float(x[low]), float(x[min(low + 1, len(x) - 1)])
+    return a + (b - a) * share if share < 0.5 else b - (b - a) * (1 - share)
 
 
 def _basis(x: F64) -> F64:
-    return np.stack([np.ones_like(x), x, x**2 / 2, x**3 / 6], axis=-1)
+    out = np.ones((*x.shape, 4))
+    out[..., 1], out[..., 2], out[..., 3] = x, x**2 / 2, x**3 / 6
+    return out

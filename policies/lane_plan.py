@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64
-from policies.base import Path, make_path
+from policies.base import Path, gradient, headings, make_path
 from policies.lane_filter import LaneState
 from policies.obstacle_vision import ObstacleTrack
 
@@ -20,6 +21,7 @@ LEAVE_BEFORE_M = 8.0
 
 HEADWAY_S, MIN_GAP_M = 1.3, 3.5
 IDM_ACCEL_MPS2, IDM_BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.5, 2.0, 7.0
+IDM_TWICE_MPS2 = 2 * math.sqrt(IDM_ACCEL_MPS2 * IDM_BRAKE_MPS2)
 
 N_SAMPLES = 6
 NOISE_LATERAL_M, NOISE_SPEED, NOISE_S = 0.15, 0.03, 3.0
@@ -40,11 +42,14 @@ class RoutePrior:
 def route_prior(points: F64) -> RoutePrior:
     """Fit the next 20 m of route points ``(M, 2)`` by a parabola in the rig frame."""
     s = arc_lengths(points)
-    near = resample(points, np.arange(0.0, min(20.0, max(float(s[-1]), 2.0)) + 0.5, 1.0))
+    near = resample(points, np.arange(0.0, min(20.0, max(float(s[-1]), 2.0)) + 0.5, 1.0), s)
     x, y = near[:, 0], near[:, 1]
     if x[-1] - x[0] < 5.0:
         return RoutePrior(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
-    half_curvature, heading, offset = np.polyfit(x, y, 2)
+    powers = np.ones((len(x), 3))  # `numpy.polyfit`, to the bit, without its checks
+    powers[:, 0], powers[:, 1] = x * x, x
+    scale = np.sqrt((powers * powers).sum(axis=0))
+    half_curvature, heading, offset = np.linalg.lstsq(powers / scale, y, len(x) * np.finfo(np.float64).eps)[0] / scale
     return RoutePrior(float(offset), float(heading), float(2 * half_curvature))
 
 
@@ -58,28 +63,38 @@ class Blend:
 
 
 def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
+    """Return the path of `fuse`, to be driven at a speed."""
+    points, route_weight, route_leaves_m = fuse(lane, route)
+    return Blend(make_path(points, PATH_M, speed_mps), route_weight, route_leaves_m)
+
+
+def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
 
     Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route does not affect the
     lateral position; it takes over beyond the paint that is seen, where it turns away from the lane (an intersection, an exit), and
     where the two are more than `SAME_LANE_M` apart.
+
+    Returns:
+        Points ``(N, 2)``, and the other two of `Blend`.
     """
     if lane is None:
         points = np.array([[0.0, 0.0], [10.0, 0.0]]) if route is None else route
-        return Blend(make_path(points, PATH_M, speed_mps), 0.0 if route is None else 1.0, np.inf)
+        return points, 0.0 if route is None else 1.0, np.inf
     if route is None:
         x = np.arange(0.0, 40.0)
         y = _straight_beyond(lane, x, max(lane.seen_to_m, 10.0))
-        return Blend(make_path(np.stack([x, y], axis=1), PATH_M, speed_mps), 0.0, np.inf)
-    points = resample(route, np.arange(0.0, max(float(arc_lengths(route)[-1]), 2.0), 1.0))
-    step = np.gradient(points, axis=0)
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+        return np.stack([x, y], axis=1), 0.0, np.inf
+    s = arc_lengths(route)
+    points = resample(route, np.arange(0.0, max(float(s[-1]), 2.0), 1.0), s)
+    step = gradient(points)
+    heading = headings(step)
     x, y = points[:, 0], points[:, 1]
-    usable = _prefix((np.abs(heading) < 1.0) & (np.gradient(x) > 0.3) & (x > -5.0))
+    usable = _prefix((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))
     y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))
     sigma = lane.sigma(np.maximum(x, 0.0))
     apart = np.abs((y - y_lane) - (y[0] - y_lane[0])) > LEAVE_M
-    turned = np.abs(heading - np.arctan(lane.slope(np.clip(x, 0.0, 30.0)))) > LEAVE_RAD
+    turned = np.abs(heading - np.arctan(lane.slope(np.minimum(np.maximum(x, 0.0), 30.0)))) > LEAVE_RAD
     leaves = np.inf
     if (apart & turned & usable).any():
         leaves = float(x[np.argmax(apart & turned & usable)])
@@ -97,7 +112,7 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     # The correction is measured along the rig's y axis; along the path's normal it is shorter by the cosine.
     fused = points + normal * (correction * np.cos(heading))[:, None]
     at_10 = int(np.argmin(np.abs(x - 10.0)))
-    return Blend(make_path(fused, PATH_M, speed_mps), float(1.0 - lane_share[at_10]), leaves)
+    return fused, float(1.0 - lane_share[at_10]), leaves
 
 
 def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float) -> F64:
@@ -106,16 +121,17 @@ def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrac
     Intelligent driver model (Treiber, Hennecke, Helbing 2000), the obstacle ahead continuing at its speed.
     """
     ahead = limits.tolist()
-    progress, s, v = [0.0], 0.0, max(speed_mps, 0.0)
-    for k in range(1, len(t_s)):
-        dt = float(t_s[k] - t_s[k - 1])
-        limit = ahead[min(int(s / Path.SPACING_M), len(ahead) - 1)]
-        accel = IDM_ACCEL_MPS2 * (1 - (v / max(cruise_mps, 0.1)) ** 4) if v < limit else (limit - v) / 0.5
+    end, cruise = len(ahead) - 1, max(float(cruise_mps), 0.1)
+    progress, s, v = [0.0], 0.0, max(float(speed_mps), 0.0)
+    other_m, other = (math.inf, 0.0) if obstacle is None else (float(obstacle.distance_m), max(float(obstacle.speed_mps), 0.0))
+    for t, dt in zip(t_s.tolist(), np.diff(t_s).tolist(), strict=False):
+        at = int(s / Path.SPACING_M)
+        limit = ahead[at if at < end else end]
+        accel = IDM_ACCEL_MPS2 * (1 - (v / cruise) ** 4) if v < limit else (limit - v) / 0.5
         accel = max(min(accel, (limit - v) / dt), -4.0)
         if obstacle is not None:
-            other = max(obstacle.speed_mps, 0.0)
-            gap = obstacle.distance_m + other * float(t_s[k - 1]) - s - bumper_m
-            wish = MIN_GAP_M + max(v * HEADWAY_S + v * (v - other) / (2 * np.sqrt(IDM_ACCEL_MPS2 * IDM_BRAKE_MPS2)), 0.0)
+            gap = other_m + other * t - s - bumper_m
+            wish = MIN_GAP_M + max(v * HEADWAY_S + v * (v - other) / IDM_TWICE_MPS2, 0.0)
             follow = IDM_ACCEL_MPS2 * (1 - (v / max(limit, 0.1)) ** 4 - (wish / max(gap, 0.1)) ** 2)
             accel = max(min(accel, follow), -HARD_BRAKE_MPS2)
         after = max(v + accel * dt, 0.0)
@@ -160,34 +176,43 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
         sigma_m: From `sample_sigma_m`.
     """
     s = arc_lengths(xy)
-    ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
+    ramp = np.minimum(s / NOISE_RAMP_M, 1.0)
     ramp_slope = np.where(s < NOISE_RAMP_M, 6 * ramp * (1 - ramp) / NOISE_RAMP_M, 0.0)
     ramp = ramp * ramp * (3 - 2 * ramp)
     ahead = np.arange(len(s)) / DRIFT_STEPS
-    out = [np.column_stack([xy, yaw])]
-    for lateral, faster in noise[1:] - noise[0]:
-        shift_m = sigma_m * float(lateral)
-        shifted = xy + shift_m * ramp[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-        line = np.column_stack([shifted, yaw + np.arctan(shift_m * ramp_slope)])
-        out.append(_retimed(line, s, s * (1.0 + NOISE_SPEED * float(faster) * ahead)))
-    return out
+    shift_m, faster = (noise[1:] - noise[0]).T[:, :, None]
+    shift_m = sigma_m * shift_m  # (N_SAMPLES - 1, 1)
+    lines = np.empty((len(shift_m), len(s), 3))
+    lines[..., :2] = xy + (shift_m * ramp)[..., None] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    lines[..., 2] = yaw + np.arctan(shift_m * ramp_slope)
+    return [np.column_stack([xy, yaw]), *_retimed(lines, s, s * (1.0 + NOISE_SPEED * faster * ahead))]
 
 
-def _retimed(line: F64, s: F64, at: F64) -> F64:
-    """Return rows of ``line`` (T, 3) at progress ``at``, straight on beyond the end; a standing plan is unchanged."""
+def _retimed(lines: F64, s: F64, at: F64) -> F64:
+    """Return ``lines`` (K, T, 3) at progress ``at`` (K, T), straight on beyond the end; a standing plan is unchanged.
+
+    Args:
+        lines: Rows at progress ``s``.
+        s: ``(T,)``.
+        at: Progress of each line.
+    """
     if s[-1] < 0.1:
-        return line
-    keep = np.concatenate([[True], np.diff(s) > 1e-9])
-    out = np.stack([np.interp(at, s[keep], line[keep, d]) for d in range(3)], axis=1)
-    over = np.maximum(at - s[-1], 0.0)
-    out[:, 0] += over * np.cos(line[-1, 2])
-    out[:, 1] += over * np.sin(line[-1, 2])
+        return lines
+    keep = np.concatenate([[True], s[1:] - s[:-1] > 1e-9])
+    knots, kept = s[keep], lines[:, keep]
+    out = np.empty_like(lines)
+    for k in range(len(lines)):
+        for d in range(3):
+            out[k, :, d] = np.interp(at[k], knots, kept[k, :, d])
+    over, end = np.maximum(at - s[-1], 0.0), lines[:, -1:, 2]
+    out[..., 0] += over * np.cos(end)
+    out[..., 1] += over * np.sin(end)
     return out
 
 
 def _straight_beyond(lane: LaneState, x: F64, limit_m: float) -> F64:
     """Return the lane's centre, carried on along its tangent beyond ``limit_m``, where a cubic would run away."""
-    inside = np.clip(x, 0.0, limit_m)
+    inside = np.minimum(np.maximum(x, 0.0), limit_m)
     return lane.centre(inside) + (x - inside) * lane.slope(inside)
 
 

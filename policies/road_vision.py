@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -37,7 +38,7 @@ class GroundGrid:
     camera_xz: tuple[float, float]  # metres, rig: where along the rig the camera stands, and how high
     camera_y: float  # metres, rig
     focal_px: float
-    sight_index: npt.NDArray[np.intp]  # (R, U) column of the grid that image column u sees on each row
+    sight_index: npt.NDArray[np.intp]  # (R, U) cell of the grid, counted row by row, that image column u sees on each row
 
     def warp(self, image: U8) -> U8:
         """Return the image over the grid ``(R, C, 3)`` or ``(R, C)``; 0 outside the image."""
@@ -84,7 +85,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     f, y_camera = float(camera.K[0, 0]), float(camera.T_rig_camera[1, 3])
     column = np.arange(camera.width) + 0.5 - camera.width / 2
     sight = (HALF_WIDTH_M - y_camera + column[None, :] * distance[:, None] / f) / CELL_M
-    seen = np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp)
+    seen = np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp) + len(y) * np.arange(len(x))[:, None]
     map_u, map_v = uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
     pixel_m = np.asarray(np.hypot(distance, height) / f, dtype=np.float64)
     return GroundGrid(x, y, map_u, map_v, inside, pixel_m, np.asarray(np.gradient(x)), (x_camera, height), y_camera, f, seen)
@@ -110,7 +111,7 @@ MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double 
 
 @dataclass(frozen=True)
 class PaintPoints:
-    """Where paint was seen: one entry per line and grid row."""
+    """Where paint was seen: one entry per line and grid row, the nearest rows first."""
 
     x_m: F64  # (N,) rig
     y_m: F64  # (N,)
@@ -118,9 +119,9 @@ class PaintPoints:
     sigma_m: F64  # (N,) lateral standard deviation
 
 
-def brightness(ground: U8) -> F32:
+def brightness(ground: U8) -> U8:
     """Return the channel ``(R, C)`` in which both white and yellow paint are bright: the mean of red and green."""
-    return np.asarray(cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0), dtype=np.float32)
+    return np.asarray(cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0))
 
 
 class RidgeFilter:
@@ -131,34 +132,51 @@ class RidgeFilter:
     """
 
     def __init__(self, grid: GroundGrid) -> None:
-        half, gap, flank = _windows(grid)
-        n = len(grid.y_m)
-        column, start = np.arange(n)[None, :], (n + 1) * np.arange(len(grid.x_m))[:, None]
+        sizes = np.stack(_windows(grid), axis=1).astype(np.intp)  # (R, 3) cells: half the stroke, start and length of a flank
+        starts = [0, *(np.flatnonzero(np.diff(sizes, axis=0).any(axis=1)) + 1).tolist(), len(sizes)]
+        # Rows of equal windows are neighbours, and a few runs of them make the grid.
+        self._runs = [(slice(a, b), *sizes[a].tolist()) for a, b in itertools.pairwise(starts)]
+        _, self._gap, flank = sizes.T
+        self._beside = np.maximum(np.rint(flank / 2), 1.0).astype(np.intp)
+        self._seen = _erode_rows(grid.inside, self._gap + flank).astype(np.float32)
 
-        def window(first: F64, last: F64) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], F32]:
-            a = np.clip(column + first[:, None], 0, n).astype(np.intp)
-            b = np.clip(column + last[:, None] + 1, 0, n).astype(np.intp)
-            return start + a, start + b, (1.0 / np.maximum(b - a, 1)).astype(np.float32)
-
-        self._windows = window(-half, half), window(-gap - flank, -gap), window(gap, gap + flank)
-        beside = np.maximum(np.rint(flank / 2), 1.0)
-        self._beside = window(-gap - beside, -gap), window(gap, gap + beside)
-        self._seen = _erode_rows(grid.inside, gap + flank)
-
-    def response(self, value: F32) -> F32:
+    def response(self, value: U8) -> F32:
         """Return the response ``(R, C)`` of a brightness ``(R, C)``; 0 where a flank is out of the image."""
-        total = np.zeros((value.shape[0], value.shape[1] + 1), dtype=np.float32)
-        np.cumsum(value, axis=1, out=total[:, 1:])
-        centre, left, right = ((np.take(total, b) - np.take(total, a)) * scale for a, b, scale in self._windows)
-        return np.asarray(np.where(self._seen, np.maximum(centre - np.maximum(left, right), 0.0), 0.0), dtype=np.float32)
+        total, n = _running_sums(value), value.shape[1]
+        out = np.zeros(value.shape, dtype=np.float32)
+        for rows, half, gap, flank in self._runs:
+            reach = gap + flank
+            if 2 * reach >= n:
+                continue
+            # Means of all flanks of a row by the column they begin at; that to the right of a cell is that to the left of one further on.
+            flanks = _means(total[rows], flank + 1)
+            centre = _means(total[rows, reach - half : n - reach + half + 1], 2 * half + 1)
+            np.subtract(centre, np.maximum(flanks[:, : n - 2 * reach], flanks[:, reach + gap :]), out=out[rows, reach : n - reach])
+        np.maximum(out, 0.0, out=out)
+        out *= self._seen
+        return out
 
     def worse_side(self, value: U8, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> F32:
         """Return the larger mean ``(N,)`` of a map ``(R, C)`` over the near halves of the two flanks of cells."""
-        total = np.zeros((value.shape[0], value.shape[1] + 1), dtype=np.float32)
-        np.cumsum(value, axis=1, dtype=np.float32, out=total[:, 1:])
-        flat = total.reshape(-1)
-        left, right = ((flat[b[rows, columns]] - flat[a[rows, columns]]) * scale[rows, columns] for a, b, scale in self._beside)
-        return np.asarray(np.maximum(left, right))
+        total, n = _running_sums(value), value.shape[1]
+        gap, beside = self._gap[rows], self._beside[rows]
+
+        def mean(first: npt.NDArray[np.intp], last: npt.NDArray[np.intp]) -> F32:
+            a, b = np.minimum(np.maximum(first, 0), n), np.minimum(np.maximum(last + 1, 0), n)
+            return np.asarray((total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(np.float32))
+
+        return np.asarray(np.maximum(mean(columns - gap - beside, columns - gap), mean(columns + gap, columns + gap + beside)))
+
+
+def _running_sums(value: U8) -> F32:
+    """Return the sums ``(R, C + 1)`` of each row up to a column: exact, as float32 holds the sum of all 72 x 321 bytes of a grid."""
+    table = cv2.integral(value, sdepth=cv2.CV_32F)
+    return np.asarray(table[1:] - table[:-1])
+
+
+def _means(total: F32, width: int) -> F32:
+    """Return the means ``(R, C + 1 - width)`` over ``width`` cells, by the first of them, of `_running_sums` ``(R, C + 1)``."""
+    return np.asarray((total[:, width:] - total[:, :-width]) * np.float32(1.0 / width))
 
 
 def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 | None = None) -> tuple[PaintPoints, Bool]:
@@ -175,15 +193,15 @@ def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 |
     smooth = cv2.blur(response, (1, 3))
     near = round(MERGE_M / CELL_M)
     peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), np.uint8))
-    spread = np.median(smooth, axis=1)
+    spread = np.sort(smooth, axis=1)[:, smooth.shape[1] // 2]  # the median, of an odd number of columns
     threshold = np.maximum(MIN_CONTRAST, NOISE_FACTOR * spread)
     is_peak = (smooth >= peak) & (smooth > threshold[:, None])
-    rows, cols = np.nonzero(is_peak)
+    rows, cols = np.divmod(np.flatnonzero(is_peak), smooth.shape[1])
     inner = (cols > 0) & (cols < smooth.shape[1] - 1)
     rows, cols = rows[inner], cols[inner]
     before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
     bend = np.maximum(2 * here - before - after, 1e-6)
-    shift = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
+    shift = np.minimum(np.maximum(0.5 * (after - before) / bend, -0.5), 0.5)
     y = np.asarray(grid.y_m[cols] - shift * CELL_M)
     strength = here / threshold[rows]
     # A bar of a crosswalk has at least two others beside it, closer than a lane width.

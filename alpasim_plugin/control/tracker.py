@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -100,6 +101,7 @@ class PerfectController(Controller):
 
 
 MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
+_SEARCHED = np.arange(41.0)
 
 
 @dataclass(frozen=True)
@@ -111,28 +113,34 @@ class ReferencePath:
     path_s: F64  # (P,) increasing progress of the path's knots
     path_xy: F64  # (P, 2) metres, world axes, relative to the origin
 
+    @cached_property
+    def pieces(self) -> tuple[F64, F64, F64]:
+        """Give of each piece between two knots its span (P - 1,) of progress, its step (P - 1, 2) and its left normal (P - 1, 2)."""
+        step = self.path_xy[1:] - self.path_xy[:-1]
+        tangent = step / np.linalg.norm(step, axis=1, keepdims=True)
+        return self.path_s[1:] - self.path_s[:-1], step, np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+
     def progress(self, t_s: F64) -> F64:
         """Return the progress (K,) planned for times (K,); the first and last pose are held outside the plan."""
         return np.asarray(np.interp(t_s, self.t_s, self.s_m))
 
     def at(self, s_m: F64) -> tuple[F64, F64]:
         """Return points (K, 2) and left normals (K, 2) of the path at progress (K,), straight beyond its ends."""
-        knots = self.path_s
-        i = np.clip(np.searchsorted(knots, s_m, side="right") - 1, 0, len(knots) - 2)
-        step = self.path_xy[i + 1] - self.path_xy[i]
-        span = knots[i + 1] - knots[i]
-        point = self.path_xy[i] + ((s_m - knots[i]) / span)[:, None] * step
-        tangent = step / np.linalg.norm(step, axis=1, keepdims=True)
-        return point, np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        knots, (span, step, normal) = self.path_s, self.pieces
+        i = np.minimum(np.maximum(np.searchsorted(knots, s_m, side="right") - 1, 0), len(span) - 1)
+        point = self.path_xy[i] + ((s_m - knots[i]) / span[i])[:, None] * step[i]
+        return point, normal[i]
 
     def project(self, xy: F64, near_s: float, window_m: float) -> float:
         """Return the progress of the path point nearest to ``xy`` (2,), searched within ``window_m`` of ``near_s``."""
-        s = near_s + np.linspace(-window_m, window_m, 41)
+        reach = _SEARCHED * (window_m / 20) - window_m
+        reach[-1] = window_m
+        s = near_s + reach
         point, _ = self.at(s)
         k = int(np.argmin(np.sum((point - xy) ** 2, axis=1)))
         foot, normal = self.at(s[k : k + 1])
         along = np.array([normal[0, 1], -normal[0, 0]])
-        return float(s[k] + np.clip((xy - foot[0]) @ along, -window_m / 20, window_m / 20))
+        return float(s[k] + min(max((xy - foot[0]) @ along, -window_m / 20), window_m / 20))
 
 
 def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> ReferencePath:
@@ -147,15 +155,16 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
     heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     mean = heading[:-1] + heading[1:]
     mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-    s = np.concatenate([[0.0], np.cumsum(np.sum(np.diff(xy, axis=0) * mean, axis=1))])
+    s = np.concatenate([[0.0], np.cumsum(np.sum((xy[1:] - xy[:-1]) * mean, axis=1))])
     # Knots in the order of time while the plan drives one way; the way is the sign of the furthest excursion.
     sign = 1.0 if s[np.argmax(np.abs(s))] >= 0 else -1.0
-    keep = [0]
-    for i in range(1, len(s)):
+    keep, places = [0], list(zip(s.tolist(), *xy.T.tolist(), strict=True))
+    s_kept, x_kept, y_kept = places[0]
+    for i, (s_i, x, y) in enumerate(places):
         # Headings that contradict the motion can make progress where nothing moves: such a step has no direction.
-        moved = float(np.hypot(*(xy[i] - xy[keep[-1]])))
-        if sign * (s[i] - s[keep[-1]]) >= MIN_SPACING_M and moved >= 0.5 * MIN_SPACING_M:
+        if sign * (s_i - s_kept) >= MIN_SPACING_M and math.hypot(x - x_kept, y - y_kept) >= 0.5 * MIN_SPACING_M:
             keep.append(i)
+            s_kept, x_kept, y_kept = s_i, x, y
     path_s, path_xy = s[keep], xy[keep]
     if len(keep) == 1:
         path_s = np.array([s[0] - 1.0, s[0] + 1.0])
@@ -179,7 +188,7 @@ HOLD_S = 2.0
 
 _BEFORE = np.tril(np.ones((NODES, NODES)), -1)  # d steer at the start of step k / d change in step j
 _MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
-_CUMULATE = np.tril(np.ones((NODES, NODES)))
+_UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
 
 
 class PlanTracker(Controller):
@@ -238,10 +247,10 @@ class PlanTracker(Controller):
         for _ in range(GAUSS_NEWTON_STEPS):
             error, jacobian = _lateral_errors(now, start, change, ds, wheelbase, target, normal, self.vehicle.max_steer_rad)
             hessian = jacobian.T @ jacobian
-            hessian[np.diag_indices(NODES)] += weight**2
+            hessian.reshape(-1)[:: NODES + 1] += weight**2
             change = change - np.linalg.solve(hessian, jacobian.T @ error + weight**2 * change)
         # The move is per node of path; in time it takes NODE_S at the preview's speed.
-        return float(np.clip(start + change[0] * CONTROL_S / NODE_S, -limit, limit))
+        return min(max(start + float(change[0]) * CONTROL_S / NODE_S, -limit), limit)
 
 
 def _lateral_errors(
@@ -251,7 +260,7 @@ def _lateral_errors(
 
     Each node is one midpoint step of length ``ds``: turn by ``ds tan(steer) / L`` and move along the mean heading.
     """
-    middle = np.clip(start + _MIDDLE @ change, -max_steer, max_steer)
+    middle = np.minimum(np.maximum(start + _MIDDLE @ change, -max_steer), max_steer)
     turn = ds * np.tan(middle) / wheelbase
     yaw_middle = now.yaw_rad + _MIDDLE @ turn
     along = np.stack([np.cos(yaw_middle), np.sin(yaw_middle)], axis=1)
@@ -261,7 +270,7 @@ def _lateral_errors(
     d_yaw = _MIDDLE @ d_turn
     left = np.stack([-along[:, 1], along[:, 0]], axis=1)
     # d error_k = normal_k . sum_{i <= k} ds left_i d_yaw_i
-    lever = np.where(_CUMULATE > 0, ds * (normal @ left.T), 0.0)
+    lever = np.where(_UP_TO, ds * (normal @ left.T), 0.0)
     return error, lever @ d_yaw
 
 

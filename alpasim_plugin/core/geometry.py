@@ -6,6 +6,7 @@ Quaternions are ``wxyz``; ``T_a_b`` maps coordinates in b to coordinates in a; a
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,26 +58,30 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     """
     r = np.asarray(rotation, dtype=np.float64)
     batch = r.shape[:-2]
-    m = r.reshape(-1, 3, 3)
+    m = r.reshape(-1, 9)
     if len(m) == 1:
         return np.array(_quat_of(*m.ravel().tolist())).reshape(*batch, 4)
-    trace = np.trace(m, axis1=1, axis2=2)
-    candidates = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
-    largest = np.argmax(candidates, axis=1)
-    d = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1)
-    s = m + np.swapaxes(m, 1, 2)
-    options = np.empty((len(m), 4, 4))
-    options[:, 0] = np.stack([1 + trace, d[:, 0], d[:, 1], d[:, 2]], axis=1)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        row = options[:, i + 1]
-        row[:, 0] = d[:, i]
-        row[:, 1 + i] = 1 + m[:, i, i] - m[:, j, j] - m[:, k, k]
-        row[:, 1 + j], row[:, 1 + k] = s[:, i, j], s[:, i, k]
-    quat = options[np.arange(len(m)), largest]
+    trace = m[:, 0] + m[:, 4] + m[:, 8]
+    largest = np.argmax(np.stack([trace, m[:, 0], m[:, 4], m[:, 8]], axis=1), axis=1)
+    quat = np.empty((len(m), 4))
+    for k in range(4):
+        rows = np.flatnonzero(largest == k)
+        if len(rows):
+            quat[rows] = np.stack(_long_quat(k, *m[rows].T), axis=1)
     quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     quat = np.where(quat[:, :1] < 0, -quat, quat)
     return np.asarray(quat.reshape(*batch, 4), dtype=np.float64)
+
+
+def _long_quat(largest: int, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any, i: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the quaternion, not yet of unit length, of matrices given row by row, of whose candidates one is known to be the largest."""
+    if largest == 0:
+        return 1 + (a + e + i), h - f, c - g, d - b
+    if largest == 1:
+        return h - f, 1 + a - e - i, b + d, c + g
+    if largest == 2:
+        return c - g, d + b, 1 + e - i - a, f + h
+    return d - b, g + c, h + f, 1 + i - a - e
 
 
 def _quat_of(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float) -> tuple[float, float, float, float]:
@@ -84,14 +89,7 @@ def _quat_of(a: float, b: float, c: float, d: float, e: float, f: float, g: floa
     trace = a + e + i
     candidates = (trace, a, e, i)
     largest = candidates.index(max(candidates)) if trace == trace else 0  # NaN is the largest, as for arrays
-    if largest == 0:
-        w, x, y, z = 1 + trace, h - f, c - g, d - b
-    elif largest == 1:
-        w, x, y, z = h - f, 1 + a - e - i, b + d, c + g
-    elif largest == 2:
-        w, x, y, z = c - g, d + b, 1 + e - i - a, f + h
-    else:
-        w, x, y, z = d - b, g + c, h + f, 1 + i - a - e
+    w, x, y, z = _long_quat(largest, a, b, c, d, e, f, g, h, i)
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if norm == 0.0:
         return math.nan, math.nan, math.nan, math.nan
@@ -188,16 +186,25 @@ def offset_trajectory(trajectory: Trajectory, T_body_other: F64) -> Trajectory:
 
 def arc_lengths(line: F64) -> F64:
     """Return the cumulative length ``(N,)`` along the xy projection of a polyline ``(N, 2+)``."""
-    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    step = line[1:, :2] - line[:-1, :2]
+    step *= step
+    s = np.zeros(len(step) + 1)
+    np.cumsum(np.sqrt(step[:, 0] + step[:, 1]), out=s[1:])
+    return s
 
 
-def resample(line: F64, s_m: npt.ArrayLike) -> F64:
-    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its ends."""
-    s = arc_lengths(line)
-    keep = np.concatenate([[True], np.diff(s) > 0])
+def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
+    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its ends; ``along`` are its `arc_lengths`."""
+    s = arc_lengths(line) if along is None else along
+    rises = s[1:] > s[:-1]
+    if not rises.all():
+        keep = np.concatenate([[True], rises])
+        s, line = s[keep], line[keep]
     at = np.asarray(s_m, dtype=np.float64)
-    return np.stack([np.interp(at, s[keep], line[keep, d]) for d in range(line.shape[1])], axis=-1)
+    out = np.empty((*at.shape, line.shape[1]))
+    for d in range(line.shape[1]):
+        out[..., d] = np.interp(at, s, line[:, d])
+    return out
 
 
 class CubicSpline:
@@ -231,18 +238,18 @@ class CubicSpline:
             tangent = scipy.linalg.lapack.dgtsv(below, diagonal, above, right)[3]
         bend = (tangent[:-1] + tangent[1:] - 2 * slope) / over
         self._at = at
-        self._terms = points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over  # (N - 1, D) each
+        self._terms = np.stack([points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over])  # (4, N - 1, D)
 
     def __call__(self, at: F64, derivative: int = 0) -> F64:
         """Return points ``(M, D)``, or their first or second derivative, at ``(M,)``; outside, those of the outermost piece."""
-        i = np.clip(np.searchsorted(self._at, at, side="right") - 1, 0, len(self._at) - 2)
+        i = np.minimum(np.maximum(np.searchsorted(self._at, at, side="right") - 1, 0), len(self._at) - 2)
         along = (at - self._at[i])[:, None]
-        total, power = np.zeros((len(at), self._terms[0].shape[1])), np.ones_like(along)
-        for k, term in enumerate(self._terms):
-            if k >= derivative:
-                total = total + term[i] * power * float(math.perm(k, derivative))
-                power = power * along
-        return total
+        terms, power = self._terms[derivative:, i], along
+        total = terms[0] * float(math.factorial(derivative))
+        for k, term in enumerate(terms[1:], derivative + 1):
+            total += term * power * float(math.perm(k, derivative))
+            power = power * along
+        return np.asarray(total)
 
 
 def project(line: F64, xy: F64) -> tuple[float, float]:

@@ -139,7 +139,8 @@ class AslFile:
             raise InfrastructureError("writing a rollout log", str(self.path), "the log is already finished", "open a new log")
         body = entry.SerializeToString()
         try:
-            self._stream.write(_LENGTH.pack(len(body)) + body)
+            self._stream.write(_LENGTH.pack(len(body)))
+            self._stream.write(body)
         except OSError as error:
             raise self._failure(error) from error
         self.entries += 1

@@ -19,6 +19,7 @@ from alpasim_plugin.log.schema import (
     EGO,
     RolloutHeader,
     wire_box,
+    wire_bytes,
     wire_camera,
     wire_dynamics,
     wire_image,
@@ -169,12 +170,15 @@ class AslWriter:
             samples: Alternatives it considered, the same way; they feed minADE.
             terminate: The driver ends the rollout.
         """
-        debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=[wire_trajectory(s, "a sampled plan") for s in samples])
-        self._write(
-            driver_return=egodriver_pb2.DriveResponse(
-                trajectory=wire_trajectory(plan, "the driver's plan"), debug_info=debug, terminate_session=terminate
-            )
+        message = egodriver_pb2.DriveResponse
+        entry = logging_pb2.LogEntry(
+            driver_return=message(trajectory=common_pb2.Trajectory(), debug_info=message.DebugInfo(), terminate_session=terminate)
         )
+        first, *others = wire_bytes([plan, *samples], "the driver's plan and its samples")
+        entry.driver_return.trajectory.MergeFromString(first)
+        for other in others:
+            entry.driver_return.debug_info.sampled_trajectories.add().MergeFromString(other)
+        self._file.write(entry)
 
     def controller_request(self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False) -> None:
         """Write the request to the vehicle model: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
@@ -188,18 +192,20 @@ class AslWriter:
         if len(plan):
             poses = se3(plan.xyz, plan.quat)
             plan = trajectory_from_poses(plan.t_us, inverse(poses[0]) @ poses)
-        self._write(
+        entry = logging_pb2.LogEntry(
             controller_request=controller_pb2.RunControllerAndVehicleModelRequest(
                 session_uuid=self._uuid,
                 state=common_pb2.StateAtTime(
                     timestamp_us=state.t_us, pose=wire_pose(state.T_world_rig, "ego state"), state=wire_dynamics(state)
                 ),
-                planned_trajectory_in_rig=wire_trajectory(plan, "the active plan"),
+                planned_trajectory_in_rig=common_pb2.Trajectory(),
                 future_time_us=to_us,
                 coerce_dynamic_state=forced,
                 pose_reporting_interval_us=self.header.control_us,
             )
         )
+        entry.controller_request.planned_trajectory_in_rig.MergeFromString(wire_bytes([plan], "the active plan")[0])
+        self._file.write(entry)
 
     def controller_return(self, state: EgoState) -> None:
         """Write the state the vehicle model reached; estimated equals true, as no pose error is modelled."""

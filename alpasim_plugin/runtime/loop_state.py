@@ -182,11 +182,11 @@ class LoopState:
         c, s = np.cos(yaw0), np.sin(yaw0)
         turn = np.array([[c, s], [-s, c]])
 
-        def place(xy: F64, yaw: F64) -> Trajectory:
-            xyz = np.column_stack([xy @ turn + origin[:2], np.full(len(xy), origin[2])])
-            return Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(yaw + yaw0)))
-
-        return [place(plan.xy, plan.yaw), *(place(sample[:, :2], sample[:, 2]) for sample in plan.samples)]
+        all_xy, all_yaw = [plan.xy, *(sample[:, :2] for sample in plan.samples)], [plan.yaw, *(sample[:, 2] for sample in plan.samples)]
+        xyz = np.full((len(all_xy), len(plan.times_us), 3), origin[2])
+        for row, xy in zip(xyz, all_xy, strict=True):
+            row[:, :2] = xy @ turn + origin[:2]
+        return [Trajectory(plan.times_us, *pose) for pose in zip(xyz, quat_from_yaw(wrap_angle(np.stack(all_yaw) + yaw0)), strict=True)]
 
     def advance(self, controller: Controller, plan: Trajectory | None, to_us: int) -> bool:
         """Move the ego to ``to_us``: along the log in the warm-up, then by the vehicle model, projected onto the ground.

@@ -276,28 +276,29 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
     line = route.xyz
     if len(line) < 2:
         return out
-    begin = _project_ahead(line, T_world_rig[:2, 3], yaw_of(T_world_rig))
+    along = arc_lengths(line)
+    begin = _project_ahead(line, along, T_world_rig[:2, 3], yaw_of(T_world_rig))
     at = begin + spacing_m * np.arange(n)
-    seen = at <= arc_lengths(line)[-1] + 1e-9
-    out[seen] = transform_points(inverse(T_world_rig), resample(line, at[seen]))
+    seen = at <= along[-1] + 1e-9
+    out[seen] = transform_points(inverse(T_world_rig), resample(line, at[seen], along))
     out[seen, 2] = 0.0
     return out
 
 
-def _project_ahead(line: F64, xy: F64, yaw: float) -> float:
-    """Return the arc length of the point of the route that is nearest in place and direction."""
+def _project_ahead(line: F64, along: F64, xy: F64, yaw: float) -> float:
+    """Return the arc length of the point of the route that is nearest in place and direction; ``along`` are those of its points."""
     step, share, offset = _on_segments(line, xy)
     distance = np.linalg.norm(offset, axis=1)
     error = np.abs(wrap_angle(np.arctan2(step[:, 1], step[:, 0]) - yaw))
     i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
-    return float(arc_lengths(line)[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
+    return float(along[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
 
 
 def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
     """Return the segments ``(S, 2)`` of a polyline, the share of each at which it is nearest to a point, and the offsets there."""
-    start, step = line[:-1, :2], np.diff(line[:, :2], axis=0)
+    start, step = line[:-1, :2], line[1:, :2] - line[:-1, :2]
     length2 = np.maximum(np.sum(step * step, axis=1), 1e-300)
-    share = np.clip(np.sum((xy - start) * step, axis=1) / length2, 0.0, 1.0)
+    share = np.minimum(np.maximum(np.sum((xy - start) * step, axis=1) / length2, 0.0), 1.0)
     return step, share, xy - (start + share[:, None] * step)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import quat_from_yaw, se2, yaw_from_quat
+from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw, se2, se3, yaw_from_quat
 from alpasim_plugin.core.types import Actor, Box, Trajectory
 from alpasim_plugin.log import AslWriter
-from alpasim_plugin.log.schema import read_poses, wire_poses, wire_trajectory
+from alpasim_plugin.log.schema import read_poses, wire_pose, wire_poses, wire_trajectory
 from alpasim_plugin.wire import common_pb2
 from tests.examples import examples
 from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
@@ -47,6 +48,18 @@ def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(n: in
     fast = wire_trajectory(trajectory, "a test")
     assert fast == slow
     assert fast.SerializeToString() == slow.SerializeToString()
+
+
+def test_one_pose_without_arrays_is_as_one_of_many_and_refuses_as_much() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        pose = se3(rng.normal(size=3) * 1000, rng.normal(size=4))  # no rotation: it is made one
+        assert wire_pose(pose, "a test") == wire_poses(pose[None, :3, 3], quat_from_matrix(pose[None, :3, :3]), "a test")[0]
+    for place, value in itertools.product(((0, 3), (1, 3), (2, 3), (0, 0), (1, 2)), (np.nan, np.inf)):
+        pose = np.eye(4)
+        pose[place] = value
+        with pytest.raises(InputError, match="a test"):
+            wire_pose(pose, "a test")
 
 
 def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path) -> None:

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.core.geometry import inverse
-from policies.lane_filter import LaneState, predict, search, shift, start, update
+from alpasim_plugin.core.geometry import arc_lengths, inverse, resample
+from policies.base import _targets, gradient, headings
+from policies.lane_filter import LaneState, _percentile_95, predict, search, shift, start, update
+from policies.lane_plan import route_prior
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Block, Line, PaintedRoad, pinhole_camera
 from policies.road_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint, make_grid
@@ -61,21 +63,21 @@ def slow_ridge(value: np.ndarray, row: int, column: int) -> float:
 
 
 def test_ridge_response_equals_plain_window_means() -> None:
-    value = np.random.default_rng(0).uniform(0, 255, GRID.inside.shape).astype(np.float32)
+    value = np.random.default_rng(0).integers(0, 256, GRID.inside.shape, dtype=np.uint8)
     fast = RIDGES.response(value)
     for row in range(0, len(GRID.x_m), 9):
         reach = int((_windows(GRID)[1] + _windows(GRID)[2])[row])
         seen = np.flatnonzero(GRID.inside[row])
         for column in range(seen[0] + reach, seen[-1] - reach, 23):
-            assert fast[row, column] == pytest.approx(slow_ridge(value, row, column), abs=0.05)
+            assert fast[row, column] == pytest.approx(slow_ridge(value, row, column), rel=1e-6, abs=1e-4)
 
 
 def test_step_edge_is_no_paint_but_a_stroke_is() -> None:
-    value = np.full(GRID.inside.shape, 90.0, np.float32)
-    value[:, 200:] = 180.0
+    value = np.full(GRID.inside.shape, 90, np.uint8)
+    value[:, 200:] = 180
     assert RIDGES.response(value)[:, 150:250].max() == 0.0
-    value[:] = 90.0
-    value[:, 159:162] = 200.0
+    value[:] = 90
+    value[:, 159:162] = 200
     assert RIDGES.response(value)[5:30, 160].min() > 60.0
 
 
@@ -268,3 +270,30 @@ def test_thing_nearer_than_the_image_reaches_keeps_its_distance() -> None:
         track = track_obstacle(track, (5.5, 0.3), 0.0, 0.1, 5.5)
         assert track is not None
     assert track.distance_m < 5.5
+
+
+# --- lines ------------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=examples(40))
+@given(seed=st.integers(0, 2**32 - 1), points=st.integers(2, 60), turn=st.sampled_from([0.02, 0.4, 2.0]))
+def test_what_is_computed_without_numpys_overhead_is_equal_to_the_bit(seed: int, points: int, turn: float) -> None:
+    random = np.random.default_rng(seed)
+    angle = np.cumsum(random.normal(0.0, turn, points))
+    line = np.cumsum(random.uniform(0.0, 2.0, (points, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1), axis=0)
+    step = np.gradient(line, axis=0)
+    assert np.array_equal(gradient(line), step)
+    assert np.array_equal(gradient(line[:, 0]), np.gradient(line[:, 0]))
+    assert np.array_equal(headings(step), np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+    assert np.array_equal(arc_lengths(line), np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]))
+    assert _percentile_95(np.sort(line[:, 0])) == np.percentile(line[:, 0], 95)
+    ahead = np.stack([np.arange(20.0), np.cumsum(random.normal(0.0, 0.1, 20))], axis=1)
+    near = resample(ahead, np.arange(0.0, min(20.0, float(arc_lengths(ahead)[-1])) + 0.5, 1.0))
+    half_curvature, heading, offset = np.polyfit(near[:, 0], near[:, 1], 2)
+    prior = route_prior(ahead)
+    assert (prior.offset_m, prior.heading_rad, prior.curvature_1pm) == (offset, heading, 2 * half_curvature)
+    (x, y), start = random.normal(0.0, 5.0, 2), int(random.integers(points))
+    distance = (line[:, 0] - x) ** 2 + (line[:, 1] - y) ** 2
+    nearest = start + int(np.argmin(distance[start : start + 8]))
+    far = np.flatnonzero(distance[nearest:] >= 9.0)
+    assert _targets(line.tolist(), float(x), float(y), start, 9.0) == (nearest, nearest + int(far[0]) if len(far) else points - 1)
