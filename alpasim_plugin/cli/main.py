@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
-from alpasim_plugin.core.lazy import installed_names
+from alpasim_plugin.core.lazy import arrow_without_pandas, installed_names
 from alpasim_plugin.io import places
 from alpasim_plugin.process.signals import Stopped, leave_at_once, stoppable
 
@@ -117,7 +117,8 @@ def make_app(verb: str | None) -> typer.Typer:
         from alpasim_plugin.cli.options import command_of
 
         module_name, _, name = verbs()[verb].partition(":")
-        module = import_module(module_name)
+        with arrow_without_pandas() if module_name.startswith(f"{__package__}.") else contextlib.nullcontext():
+            module = import_module(module_name)
         found = getattr(module, name)
         if isinstance(found, typer.Typer):
             app.add_typer(found, name=verb)
@@ -271,7 +272,7 @@ def _complete() -> None:
 
 def load_workers_early(args: Sequence[str]) -> None:
     """Let what rollouts need be loaded beside this process, if it is about to have some driven by workers of this machine."""
-    is_run = bool(args) and (args[0] == "run" or args[0] not in verbs())
+    is_run = bool(args) and (args[0] == "run" or args[0].startswith("-") or args[0] not in verbs())
     if is_run and not re.search(r"--(help|version|dry-run|executor|workers[= ]1\b)", " ".join(args)) and (os.cpu_count() or 1) > 1:
         from alpasim_plugin.runtime.executors.local import load_early
 

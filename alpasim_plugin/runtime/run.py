@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
+from alpasim_plugin import __version__
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts.source import own_code_digest
@@ -293,7 +294,7 @@ def origin_of(command: Sequence[str]) -> dict[str, Any]:
     """Return what ``run.json`` says of how a run folder came about: command, version, time, the user's project."""
     return {
         "command": list(command),
-        "version": versions()["alpasim-onefixer"],
+        "version": __version__,
         "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "project": project(),
     }
