@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ BEFORE_US = 1_000_000  # of an event: the pictures that led to it
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
 
+T = TypeVar("T")
 Rows = Sequence[Mapping[str, Any]]  # facts of the frames, as `frames.jsonl` has them
 
 
@@ -53,21 +55,23 @@ class Source:
     images: tuple[LoggedImage, ...] = ()
     video: tuple[Path, int] | None = None
 
-    def frames(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
-        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame.
+    def each(self, stride: int, work: Callable[[int, U8], T]) -> list[T]:
+        """Return what work makes of time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame; threads do that of a log.
 
         Raises:
             InputError: A frame cannot be decoded.
         """
+
+        def of_log(image: LoggedImage) -> T:
+            return work(image.end_us, decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us"))
+
         if self.video is None:
-            for image in self.images[::stride]:
-                yield image.end_us, decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
-            return
+            with ThreadPoolExecutor(thread_name_prefix="pictures") as threads:  # OpenCV does not hold Python's lock
+                return list(threads.map(of_log, self.images[::stride]))
         path, start_us = self.video
         with VideoReader(path) as video:
-            for index, frame in enumerate(video):
-                if index % stride == 0:
-                    yield start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image
+            shown = (frame for index, frame in enumerate(video) if index % stride == 0)
+            return [work(start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image) for frame in shown]
 
 
 def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
@@ -83,13 +87,15 @@ def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
 
 def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
     """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in base64."""
-    t_ms, data, size = [], [], (0, 0)
-    for t_us, rgb in source.frames(fine.stride):
+
+    def made(t_us: int, rgb: U8) -> tuple[int, tuple[int, ...], str]:
         picture = smaller(rgb, fine.width_px)
-        size = (picture.shape[1], picture.shape[0])
-        t_ms.append(round((t_us - zero_us) / 1000))
-        data.append(jpeg(picture))
-    return {"name": source.camera, "width": size[0], "height": size[1], "t": t_ms, "jpeg": data}
+        return round((t_us - zero_us) / 1000), picture.shape, jpeg(picture)
+
+    frames = source.each(fine.stride, made)
+    height, width = frames[-1][1][:2] if frames else (0, 0)
+    t_ms, data = [t for t, _, _ in frames], [data for _, _, data in frames]
+    return {"name": source.camera, "width": width, "height": height, "t": t_ms, "jpeg": data}
 
 
 def jpeg(rgb: U8) -> str:
