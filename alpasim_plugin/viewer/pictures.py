@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ BEFORE_US = 1_000_000  # of an event: the pictures that led to it
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
 
-T = TypeVar("T")
 Rows = Sequence[Mapping[str, Any]]  # facts of the frames, as `frames.jsonl` has them
 
 
@@ -55,23 +54,27 @@ class Source:
     images: tuple[LoggedImage, ...] = ()
     video: tuple[Path, int] | None = None
 
-    def each(self, stride: int, work: Callable[[int, U8], T]) -> list[T]:
-        """Return what work makes of time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame; threads do that of a log.
+    def decoded(self, image: LoggedImage) -> U8:
+        """Return the ``(H, W, 3)`` uint8 sRGB of one of the images.
+
+        Raises:
+            InputError: It cannot be decoded.
+        """
+        return decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
+
+    def filmed(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
+        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame of the video; nothing where there is none.
 
         Raises:
             InputError: A frame cannot be decoded.
         """
-
-        def of_log(image: LoggedImage) -> T:
-            return work(image.end_us, decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us"))
-
         if self.video is None:
-            with ThreadPoolExecutor(thread_name_prefix="pictures") as threads:  # OpenCV does not hold Python's lock
-                return list(threads.map(of_log, self.images[::stride]))
+            return
         path, start_us = self.video
         with VideoReader(path) as video:
-            shown = (frame for index, frame in enumerate(video) if index % stride == 0)
-            return [work(start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image) for frame in shown]
+            for index, frame in enumerate(video):
+                if index % stride == 0:
+                    yield start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image
 
 
 def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
@@ -92,7 +95,9 @@ def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
         picture = smaller(rgb, fine.width_px)
         return round((t_us - zero_us) / 1000), picture.shape, jpeg(picture)
 
-    frames = source.each(fine.stride, made)
+    with ThreadPoolExecutor(thread_name_prefix="pictures") as threads:  # OpenCV does not hold Python's lock
+        frames = list(threads.map(lambda image: made(image.end_us, source.decoded(image)), source.images[:: fine.stride]))
+    frames += [made(t_us, rgb) for t_us, rgb in source.filmed(fine.stride)]
     height, width = frames[-1][1][:2] if frames else (0, 0)
     t_ms, data = [t for t, _, _ in frames], [data for _, _, data in frames]
     return {"name": source.camera, "width": width, "height": height, "t": t_ms, "jpeg": data}
