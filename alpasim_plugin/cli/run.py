@@ -24,8 +24,6 @@ from alpasim_plugin.runtime.certificate import certificate_line, foreseen
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
-from evaluators.opening import read_run
-from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 from evaluators.statistics.arms import arms_of, base_named
 from scenarios.suite import expand, shipped_names
 
@@ -128,6 +126,9 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
+    from evaluators.opening import read_run  # what a run ends with is loaded while it is driven
+    from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
+
     run = read_run(result.root)
     Console().print(render_table(result.summary, headline_only=True, known=run.table))
     for line in fixer_lines(result.summary):

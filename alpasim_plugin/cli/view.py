@@ -21,7 +21,6 @@ from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options, write_page
-from alpasim_plugin.viewer.serve import RunServer, loopback
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_so_far
 from evaluators.report import render_table
@@ -86,6 +85,8 @@ def view(
 
 
 def _serve(root: Path, address: str, wanted: Wanted, options: Options, as_json: bool) -> None:
+    from alpasim_plugin.viewer.serve import RunServer, loopback  # a page needs no web server
+
     with RunServer(loopback(address), lambda: read_so_far(root), wanted, options) as server:
         print(json.dumps({"serving": str(root), "at": server.url}) if as_json else f"watch    {server.url}   # Ctrl-C ends it", flush=True)
         try:

@@ -235,7 +235,7 @@ class CubicSpline:
             right[-1] = (step[-1] ** 2 * slope[-2] + (2 * last + step[-1]) * step[-2] * slope[-1]) / last
             diagonal = np.concatenate([[step[1]], 2 * (step[:-1] + step[1:]), [step[-2]]])
             below, above = np.concatenate([step[1:], [last]]), np.concatenate([[first], step[:-1]])
-            tangent = scipy.linalg.lapack.dgtsv(below, diagonal, above, right)[3]
+            tangent = solve_tridiagonal(below, diagonal, above, right)
         bend = (tangent[:-1] + tangent[1:] - 2 * slope) / over
         self._at = at
         self._terms = np.stack([points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over])  # (4, N - 1, D)
@@ -250,6 +250,31 @@ class CubicSpline:
             total += term * power * float(math.perm(k, derivative))
             power = power * along
         return np.asarray(total)
+
+
+def solve_tridiagonal(below: F64, diagonal: F64, above: F64, right: F64) -> F64:
+    """Return X ``(N, D)`` of A X = right, A having the diagonals ``(N - 1,)``, ``(N,)``, ``(N - 1,)``; N at least two.
+
+    Elimination with exchange of neighbouring rows, operation by operation LAPACK's ``dgtsv``; ``scipy.linalg`` takes longer to load.
+    """
+    low, mid, up, rows = below.tolist(), diagonal.tolist(), above.tolist(), right.tolist()
+    for i in range(len(low)):
+        if abs(mid[i]) >= abs(low[i]):
+            factor, low[i] = low[i] / mid[i], 0.0
+            mid[i + 1] -= factor * up[i]
+        else:
+            factor, mid[i], up[i], mid[i + 1] = mid[i] / low[i], low[i], mid[i + 1], up[i] - mid[i] / low[i] * mid[i + 1]
+            rows[i], rows[i + 1] = rows[i + 1], rows[i]
+            if i + 1 < len(up):
+                low[i], up[i + 1] = up[i + 1], -factor * up[i + 1]  # from here on the second diagonal above
+        rows[i + 1] = [y - factor * x for x, y in zip(rows[i], rows[i + 1], strict=True)]
+    low[-1:] = [0.0, 0.0]
+    up.append(0.0)
+    after = after_next = [0.0] * right.shape[1]
+    for i in reversed(range(len(mid))):
+        solved = [(x - up[i] * y - low[i] * z) / mid[i] for x, y, z in zip(rows[i], after, after_next, strict=True)]
+        rows[i], after, after_next = solved, solved, after
+    return np.array(rows)
 
 
 def project(line: F64, xy: F64) -> tuple[float, float]:

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, distributions
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import InputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
@@ -46,6 +49,36 @@ def require_library(module: str, doing: str, with_what: str, do_this: str) -> An
         return import_module(module)
     except ImportError as error:
         raise InputError(doing, with_what, f"the library {module.partition('.')[0]} cannot be imported: {error}", do_this) from error
+
+
+class _NoPandas:
+    """A finder by which pandas is not installed."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> None:
+        if name == "pandas":
+            raise ImportError("not needed")
+
+
+@contextmanager
+def arrow_without_pandas() -> Iterator[None]:
+    """Let pyarrow not load pandas, where a block of imports loads pyarrow: 0.1 s, to recognise objects that nobody hands it.
+
+    Other people's code may: `arrow_with_pandas` comes before it.
+    """
+    sys.meta_path.insert(0, _NoPandas)
+    try:
+        yield
+        if "pyarrow" in sys.modules:
+            sys.modules["pyarrow"].array([0])  # looks for it, and then no more
+    finally:
+        sys.meta_path.remove(_NoPandas)
+
+
+def arrow_with_pandas() -> None:
+    """Let pyarrow look for pandas again."""
+    if "pyarrow" in sys.modules:
+        sys.modules["pyarrow"].lib._pandas_api.__init__()
 
 
 def installed(group: str) -> Mapping[str, EntryPoint]:
@@ -92,6 +125,8 @@ def _points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
 
     Scanning the installed packages takes tens of milliseconds and changes only with the import path.
     """
+    from importlib.metadata import distributions
+
     seen = set[str]()
     found: list[EntryPoint] = []
     for one in distributions(path=list(path)):

@@ -186,7 +186,10 @@ class GaussianCloud:
 
     def take(self, index: npt.ArrayLike) -> GaussianCloud:
         """Return the Gaussians chosen by an index or mask array, in that order."""
-        i = np.asarray(index)
+        return self.part(np.asarray(index))
+
+    def part(self, i: slice | npt.NDArray[np.integer | np.bool_]) -> GaussianCloud:
+        """Return the Gaussians of an index, or a view of those of a slice."""
         return GaussianCloud(self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i])
 
     def transformed(self, T: F64, rotate_colour: bool = True) -> GaussianCloud:

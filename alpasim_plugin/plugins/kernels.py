@@ -77,14 +77,16 @@ class _Compiled:
         """Return a kernel that was compiled for arguments of these types; None where there is none."""
         if _filled is not None:
             return None
+        from numba.core.compiler import CompileResult
+        from numba.core.runtime import rtsys
+
+        rtsys.initialize(target_context)  # what kernels call; numba would also load all that compiling takes, scipy.linalg too: 0.2 s
         folder = shipped()
         path = None if folder is None else folder / self._name(sig)
-        if path is None or not path.exists():
-            return self._cached.load_overload(sig, target_context)
-        from numba.core.compiler import CompileResult
-
-        target_context.refresh()
-        return CompileResult._rebuild(target_context, *pickle.loads(path.read_bytes()))
+        if path is not None and path.exists():
+            return CompileResult._rebuild(target_context, *pickle.loads(path.read_bytes()))
+        with self._cached._guard_against_spurious_io_errors():
+            return self._cached._load_overload(sig, target_context)
 
     def save_overload(self, sig, data):
         """Keep what was just compiled: in the user's cache, or in the folder that is being filled."""

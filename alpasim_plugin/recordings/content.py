@@ -63,9 +63,8 @@ class Camera:
         """
         for image in self.source.images:
             yield Picture(image.end_us, media_type_of(image.data, f"camera {self.name!r} at {image.end_us} us"), image.data)
-        if self.source.video is not None:
-            for t_us, rgb in self.source.frames():
-                yield Picture(t_us, "image/jpeg", encode_image(rgb, "jpeg"))
+        for t_us, rgb in self.source.filmed():
+            yield Picture(t_us, "image/jpeg", encode_image(rgb, "jpeg"))
 
 
 @dataclass(frozen=True)

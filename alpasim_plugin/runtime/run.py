@@ -7,9 +7,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Any, Protocol
 
+from alpasim_plugin import __version__
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts.source import own_code_digest
@@ -35,7 +38,6 @@ from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_bu
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
-from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
 from evaluators.statistics.families import grouped
@@ -146,6 +148,8 @@ def execute_run(
         progress.started(plan, root, threads)
         began = time.perf_counter()
         how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
+        if threads.workers > 1:
+            Thread(target=_load_ending, daemon=True).start()
         try:
             with repeating(plan, root, certificate) as repeat:
                 known = contents.rollouts if contents else ()
@@ -157,6 +161,12 @@ def execute_run(
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
         publish(root, store)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+
+
+def _load_ending() -> None:
+    """Load what the tables and reports take, while workers drive."""
+    for module in ("scipy.special", "alpasim_plugin.runtime.reports", "evaluators.report.terminal"):
+        import_module(module)
 
 
 def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True) -> dict[str, Any]:
@@ -174,6 +184,8 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
     paths = {scene: str((facts.get("ref") or {}).get("path") or scene) for scene, facts in (info.get("scenes") or {}).items()}
     summary = write_summary(root, manifests, info["preset"], baseline, more, bases, MetricTable.of_run(info), grouped(paths))
+    from alpasim_plugin.runtime.reports import write_reports  # `_load_ending` has loaded it
+
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
@@ -293,7 +305,7 @@ def origin_of(command: Sequence[str]) -> dict[str, Any]:
     """Return what ``run.json`` says of how a run folder came about: command, version, time, the user's project."""
     return {
         "command": list(command),
-        "version": versions()["alpasim-onefixer"],
+        "version": __version__,
         "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "project": project(),
     }

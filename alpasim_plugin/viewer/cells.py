@@ -223,7 +223,7 @@ def read_log(path: Path) -> RolloutLog:
     return _log_as_of(path, path.stat().st_mtime_ns if path.exists() else 0)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=6)  # two cells behind three renderers
 def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
     return read_asl(path)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,15 +54,21 @@ class Source:
     images: tuple[LoggedImage, ...] = ()
     video: tuple[Path, int] | None = None
 
-    def frames(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
-        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame.
+    def decoded(self, image: LoggedImage) -> U8:
+        """Return the ``(H, W, 3)`` uint8 sRGB of one of the images.
+
+        Raises:
+            InputError: It cannot be decoded.
+        """
+        return decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
+
+    def filmed(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
+        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame of the video; nothing where there is none.
 
         Raises:
             InputError: A frame cannot be decoded.
         """
         if self.video is None:
-            for image in self.images[::stride]:
-                yield image.end_us, decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
             return
         path, start_us = self.video
         with VideoReader(path) as video:
@@ -83,13 +90,17 @@ def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
 
 def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
     """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in base64."""
-    t_ms, data, size = [], [], (0, 0)
-    for t_us, rgb in source.frames(fine.stride):
+
+    def made(t_us: int, rgb: U8) -> tuple[int, tuple[int, ...], str]:
         picture = smaller(rgb, fine.width_px)
-        size = (picture.shape[1], picture.shape[0])
-        t_ms.append(round((t_us - zero_us) / 1000))
-        data.append(jpeg(picture))
-    return {"name": source.camera, "width": size[0], "height": size[1], "t": t_ms, "jpeg": data}
+        return round((t_us - zero_us) / 1000), picture.shape, jpeg(picture)
+
+    with ThreadPoolExecutor(thread_name_prefix="pictures") as threads:  # OpenCV does not hold Python's lock
+        frames = list(threads.map(lambda image: made(image.end_us, source.decoded(image)), source.images[:: fine.stride]))
+    frames += [made(t_us, rgb) for t_us, rgb in source.filmed(fine.stride)]
+    height, width = frames[-1][1][:2] if frames else (0, 0)
+    t_ms, data = [t for t, _, _ in frames], [data for _, _, data in frames]
+    return {"name": source.camera, "width": width, "height": height, "t": t_ms, "jpeg": data}
 
 
 def jpeg(rgb: U8) -> str:

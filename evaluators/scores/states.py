@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
@@ -174,7 +173,7 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
     wanted[times] = math.factorial(times) / step**times
     eps = np.finfo(np.float64).eps
     design = offset ** np.arange(order + 1.0)[:, None]
-    weights = scipy.linalg.lstsq(design, wanted, cond=eps * max(design.shape))[0][::-1]
+    weights = np.linalg.lstsq(design, wanted, rcond=eps * max(design.shape))[0][::-1]
     padded = np.concatenate([np.zeros(half), values, np.zeros(half)])
     begin = half - (window - 1) // 2  # in the padded values: an even window reaches one value further ahead than back
     at = [padded[begin + k : begin + k + n] for k in range(window)]
@@ -193,7 +192,7 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
     for start, first, last in ((0, 0, half), (n - window, n - half, n)):
         fit = np.vander(np.arange(window, dtype=np.float64), order + 1)
         scale = np.sqrt(np.sum(fit * fit, axis=0))
-        solved = scipy.linalg.lstsq(fit / scale, values[start : start + window, None], cond=window * eps)[0]
+        solved = np.linalg.lstsq(fit / scale, values[start : start + window, None], rcond=window * eps)[0]
         polynomial = np.polyder(solved[:, 0] / scale, times)
         out[first:last] = np.polyval(polynomial, np.arange(first - start, last - start, dtype=np.float64)) / step**times
     return np.asarray(out)

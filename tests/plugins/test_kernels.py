@@ -60,6 +60,26 @@ def test_an_edited_constant_is_served_neither_from_the_package_nor_from_the_cach
     assert ask() == [64, 0]
 
 
+CALL = """
+import sys
+import numba
+from alpasim_plugin.plugins import kernels
+from alpasim_plugin.gaussians.raster.raster_kernels import pixel_of
+print(pixel_of(2, 0, 0, 0)[0], sum(pixel_of.stats.cache_hits.values()), int("scipy.linalg" in sys.modules))
+print(numba.njit(lambda tile: pixel_of(tile, 0, 0, 0))(2)[0])
+"""
+
+
+def test_a_kernel_from_the_cache_is_called_and_compiled_into_another_without_what_compiling_takes(tmp_path: Path) -> None:
+    def call() -> list[int]:
+        settings = {"NUMBA_CACHE_DIR": str(tmp_path)}
+        found = subprocess.run([sys.executable, "-c", CALL], check=True, capture_output=True, env=os.environ | settings).stdout
+        return [int(word) for word in found.split()]
+
+    assert call() == [32, 0, 1, 32]
+    assert call() == [32, 1, 0, 32]
+
+
 def test_kernels_of_the_core_are_all_made_here() -> None:
     rooms = [room for room in PACKAGE.iterdir() if room.is_dir() and room.name != "lab"]  # another distribution
     texts = {path: path.read_text() for room in rooms for path in room.rglob("*.py")}

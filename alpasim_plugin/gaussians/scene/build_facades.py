@@ -184,12 +184,14 @@ def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells:
     # The same hash by place gives every level the wall's large stains; the fine grain belongs to the finest level.
     grain = site.rng(f"facade-grain-{cells}").standard_normal(len(wall)) * (0.035 if cells >= 6 else 0.015) * texture
     rgb = style["wall"][house] * (shade + grain)[:, None]
-    rgb = np.where(sill[:, None] & front[:, None], style["trim"][house] * shade[:, None], rgb)
+    trim = sill & front
+    rgb[trim] = style["trim"][house[trim]] * shade[trim, None]
     cornice = (iv == nv - 1) & (cells > 1)
-    rgb = np.where(cornice[:, None], style["trim"][house] * 0.92 * shade[:, None], rgb)
+    rgb[cornice] = style["trim"][house[cornice]] * 0.92 * shade[cornice, None]
     rgb = rgb + share[:, None] * (glass * np.where(front, 1.0, 0.85)[:, None] - rgb)
-    rgb = np.where(band[:, None], 0.5 * rgb + 0.5 * style["awning"][house] if cells == 1 else style["awning"][house], rgb)
-    rgb = np.where(door[:, None], style["awning"][house] * 0.6, rgb)
+    awning = style["awning"][house[band]]
+    rgb[band] = 0.5 * rgb[band] + 0.5 * awning if cells == 1 else awning
+    rgb[door] = style["awning"][house[door]] * 0.6
 
     plan = starts[wall] + u[:, None] * (ends - starts)[wall]
     z = base[wall] - 0.2 + v * (height[wall] + 0.2)

@@ -71,7 +71,8 @@ def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     """Return the Gaussians of each tile; ``tile (N,)`` names the tile of each Gaussian."""
     order = np.argsort(tile, kind="stable")
     ids, first = np.unique(tile[order], return_index=True)
-    return {int(i): cloud.take(part) for i, part in zip(ids, np.split(order, first[1:]), strict=True)}
+    ordered, ends = cloud.take(order), [*first[1:], len(order)]
+    return {int(i): ordered.part(slice(begin, end)) for i, begin, end in zip(ids, first, ends, strict=True)}
 
 
 def tile_numbers(xy: npt.NDArray[np.floating], size_m: float, row: int = 100_000) -> I64:

@@ -8,18 +8,21 @@ from __future__ import annotations
 import gc
 from importlib import import_module
 
+from alpasim_plugin.core.lazy import arrow_without_pandas
+
 NEEDED = (
     "alpasim_plugin.control.tracker", "alpasim_plugin.renderers.gaussian", "alpasim_plugin.runtime.execute",
     "evaluators.metrics.image_health", "evaluators.metrics.motion", "evaluators.metrics.offroad", "evaluators.metrics.outcomes",
-    "evaluators.metrics.plan", "policies.lane_camera", "pyarrow.dataset", "scipy.linalg.lapack",
+    "evaluators.metrics.plan", "policies.lane_camera", "pyarrow.dataset",
 )  # fmt: skip
 
 
 def load() -> None:
     """Load it, and keep the collector from looking through what stays: no copy then writes to the memory that they share."""
     gc.disable()
-    for name in NEEDED:
-        import_module(name)
+    with arrow_without_pandas():
+        for name in NEEDED:
+            import_module(name)
     from alpasim_plugin.plugins import kernels
     from alpasim_plugin.runtime.execute import is_cold
 
