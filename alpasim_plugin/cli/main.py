@@ -6,7 +6,6 @@ Only light modules are imported here: until a verb's own are loaded, a signal en
 from __future__ import annotations
 
 import ast
-import atexit
 import contextlib
 import difflib
 import errno
@@ -289,19 +288,7 @@ def main() -> None:
             load_workers_early(sys.argv[1:])
     if "_SIMRUN_COMPLETE" in os.environ:
         _complete()
-    code = run_command(sys.argv[1:])
-    if vars(sys.modules["__main__"]).get("main") is main:  # no program of somebody else's that goes on
-        _end(code)
-    sys.exit(code)
-
-
-def _end(code: int) -> None:
-    """End this process as Python does, but leave it to the system to take down what was imported: 0.03 s."""
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError, AttributeError):
-            stream.flush()
-    os._exit(code)
+    sys.exit(run_command(sys.argv[1:]))
 
 
 if __name__ == "__main__":
