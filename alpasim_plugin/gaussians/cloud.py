@@ -162,12 +162,21 @@ class GaussianCloud:
         )
         return cloud, CleanReport(n, len(cloud), dropped, repaired)
 
+    def _drawable(self) -> bool:
+        """Return whether every Gaussian can be drawn: whole arrays, as numpy is slow along an axis of three."""
+        scales, opacities, (w, x, y, z) = self.scales, self.opacities, self.quats.T
+        within = not len(self) or (scales.min() >= 0 and scales.max() <= LARGEST_SCALE_M and opacities.min() >= 0 and opacities.max() <= 1)
+        turns = bool((w != 0).all()) or bool(((w != 0) | (x != 0) | (y != 0) | (z != 0)).all())
+        return bool(within) and turns and all(np.isfinite(array).all() for array in (self.means, self.quats, self.sh))
+
     def require_drawable(self, doing: str) -> None:
         """Raise where any Gaussian could not be drawn.
 
         Raises:
             InputError: Names the first cause and its count; `cleaned` removes such Gaussians.
         """
+        if self._drawable():
+            return
         checks = {
             "non-finite mean": np.isfinite(self.means).all(axis=1),
             "zero or non-finite quaternion": np.isfinite(self.quats).all(axis=1) & (np.abs(self.quats).max(axis=1, initial=0.0) > 0),

@@ -106,7 +106,7 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = (kept.rotations() * kept.scales.astype(np.float64)[:, None, :]).reshape(n, 9)
     geometry[:, GEO_PEAK] = (np.log2(opacity) + 4.0) / 8.0
     geometry[:, GEO_EXTENT] = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
-    geometry[:, GEO_REACH] = kept.scales.max(axis=1, initial=0.0)
+    geometry[:, GEO_REACH] = np.maximum(np.maximum(*kept.scales[:, :2].T), kept.scales[:, 2])  # numpy is slow along an axis of three
     # A mean of NaN in the lanes that fill up the last group fails every comparison, so they are never drawn.
     means, reach = kept.means.astype(np.float64), geometry[:, GEO_REACH].astype(np.float64)
     return PreparedCloud(
@@ -136,20 +136,23 @@ def _bounding_spheres(means: F64, reach: F64, bundle: int) -> F64:
     if len(means) == 0:
         return np.zeros(0)
     starts = np.arange(0, len(means), bundle)
-    centre = (np.minimum.reduceat(means, starts) + np.maximum.reduceat(means, starts)) / 2
-    distance = np.linalg.norm(means - np.repeat(centre, np.diff([*starts, len(means)]), axis=0), axis=1)
+    columns = np.ascontiguousarray(means.T)
+    centre = (np.minimum.reduceat(columns, starts, axis=1) + np.maximum.reduceat(columns, starts, axis=1)) / 2
+    x, y, z = columns - centre[:, np.arange(len(means)) // bundle]
+    distance = np.sqrt(x * x + y * y + z * z)
     # Slightly enlarged: the radius must also hold after rounding.
     radius = np.maximum.reduceat(distance, starts) * (1 + 1e-9) + 1e-9
-    return np.column_stack([centre, radius, np.maximum.reduceat(reach, starts)]).reshape(-1)
+    return np.column_stack([*centre, radius, np.maximum.reduceat(reach, starts)]).reshape(-1)
 
 
 def _morton_codes(points: npt.NDArray[np.floating]) -> npt.NDArray[np.uint64]:
     """Return the positions of points ``(N, 3)`` along a Z-order curve through their bounding box, 16 bits an axis."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
-    low = points.min(axis=0)
-    span = np.maximum(points.max(axis=0) - low, 1e-9).max()
-    cell = np.minimum((points - low) / span * 65536.0, 65535.0).astype(np.uint64)
+    columns = np.ascontiguousarray(points.T)
+    low = columns.min(axis=1, keepdims=True)
+    span = np.maximum(columns.max(axis=1, keepdims=True) - low, 1e-9).max()
+    cell = np.minimum((columns - low) / span * 65536.0, 65535.0).astype(np.uint64)
     for shift, mask in ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249)):
         cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
-    return np.asarray(cell[:, 0] | (cell[:, 1] << np.uint64(1)) | (cell[:, 2] << np.uint64(2)))
+    return np.asarray(cell[0] | (cell[1] << np.uint64(1)) | (cell[2] << np.uint64(2)))
