@@ -27,6 +27,8 @@ PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
 ASPHALT = (0.335, 0.335, 0.345)
 PAVEMENT = (0.55, 0.53, 0.50)
 GRASS = (0.33, 0.40, 0.22)
+GRAVEL = (0.46, 0.43, 0.38)
+FORECOURT = (0.47, 0.45, 0.42)
 KERB_M = 0.12
 TRENCH_M, TRENCH_DEPTH_M = 0.16, 0.03  # asphalt this near to paint lies this much lower, see build_road
 PAVEMENT_M = 2.6  # width of the pavement beside the road
@@ -127,16 +129,18 @@ def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
 
 def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
     """Colour cells ``(N,)`` of the ground beside the road, ``(N, 3)``: pavement with slabs, then forecourt or grass."""
-    grass = np.array(GRASS, dtype=np.float32) * (1 + 0.20 * texture * grain[..., None])
     if site.highway:
-        gravel = np.array([0.46, 0.43, 0.38], dtype=np.float32) * (1 + 0.08 * texture * grain[..., None])
-        return np.where((off < 1.0)[..., None], gravel, grass)
-    pavement = np.array(PAVEMENT, dtype=np.float32) * (1 + 0.06 * texture * grain[..., None])
-    joint = (np.abs(off - 1.3) < 0.07)[..., None]
-    pavement = np.where(joint, 0.85 * pavement, pavement)
-    built = site.scenario.environment.buildings
-    forecourt = np.array([0.47, 0.45, 0.42], dtype=np.float32) * (1 + 0.08 * texture * grain[..., None]) if built > 0.5 else grass
-    return np.where((off < PAVEMENT_M)[..., None], pavement, np.where((off < FORECOURT_M)[..., None], forecourt, grass))
+        sorts, sort = ((GRASS, 0.20), (GRAVEL, 0.08)), (off < 1.0).astype(np.intp)
+    else:
+        beyond = (FORECOURT, 0.08) if site.scenario.environment.buildings > 0.5 else (GRASS, 0.20)
+        sorts = (GRASS, 0.20), beyond, (PAVEMENT, 0.06)
+        sort = (off < FORECOURT_M).astype(np.intp) + (off < PAVEMENT_M)
+    colours, contrast = (np.array(column, dtype=np.float32) for column in zip(*((c, k * texture) for c, k in sorts), strict=True))
+    rgb = colours[sort] * (1 + contrast[sort] * grain)[:, None]
+    if not site.highway:
+        joint = (np.abs(off - 1.3) < 0.07) & (off < PAVEMENT_M)
+        rgb[joint] = np.float32(0.85) * rgb[joint]
+    return np.asarray(rgb)
 
 
 def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:

@@ -33,6 +33,7 @@ _FROM = re.compile(rb"^[ \t]*from[ \t]+(\.*[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[
 _IMPORT = re.compile(rb"^[ \t]*import[ \t]+([^\n#]+)", re.MULTILINE)
 _TYPES_ONLY = re.compile(rb"^if (?:typing\.)?TYPE_CHECKING:\n(?:[ \t]+[^\n]*\n|\n)+", re.MULTILINE)
 _COMMENT = re.compile(rb"#[^\n]*")
+PACKAGE = os.sep + "__init__.py"  # the file of a package, in its folder
 
 
 def code_digest(file: str | Path) -> str:
@@ -158,6 +159,8 @@ def _find_imported(path: str, root: str) -> Iterator[str]:
             found = _own_file(tuple(parts[:depth])) if own else module_file(root, parts[:depth])
             if found is not None:
                 yield found
+                if not found.endswith(PACKAGE):
+                    break  # what is in a file is no module: two looks at the disk less for most names
         face = _own_file(tuple(parts[:-1])) if own and len(parts) > 1 else None
         home = None if face is None else _read(face).lazy.get(parts[-1])
         found = None if home is None else _own_file(tuple(home.split(".")))
@@ -173,7 +176,7 @@ def _own_file(parts: tuple[str, ...]) -> str | None:
 def module_file(root: str, parts: Sequence[str]) -> str | None:
     """Return the file of a module below a folder, ``__init__.py`` of a package; None where there is none."""
     path = os.path.join(root, *parts)
-    package = os.path.join(path, "__init__.py")
+    package = path + PACKAGE
     if os.path.isfile(package):
         return package
     return path + ".py" if os.path.isfile(path + ".py") else None

@@ -8,6 +8,9 @@ from __future__ import annotations
 import gc
 from importlib import import_module
 
+import cv2
+import numpy as np
+
 from alpasim_plugin.core.lazy import arrow_without_pandas
 
 NEEDED = (
@@ -28,6 +31,8 @@ def load() -> None:
 
     if not is_cold("rasteriser"):
         kernels.call("rasteriser")
+    cv2.setNumThreads(1)  # no threads of its own, which a copy would not have
+    cv2.cvtColor(np.zeros((1, 1, 3), np.uint8), cv2.COLOR_RGB2Lab)  # the first conversion computes tables for 0.07 s
     gc.freeze()
     gc.enable()
 
