@@ -1,10 +1,11 @@
 """Closed-loop error against cost: every setting that trades one for the other, from one record.
 
-    python docs/scripts/pareto.py drive DRIVES.json [SCENE...]     # 20 shipped scenes by default; what the file has is kept
+    python docs/scripts/pareto.py drive DRIVES.json [SCENE...] [--deep FILE]   # 20 shipped scenes by default; what the file has is kept
     python docs/scripts/pareto.py table DRIVES.json                # table and figure of docs/experiments/speed-and-error.md
 
 A scene is driven with every setting in turn, in one process, so that a busy machine slows all alike. The error of a drive is how far its
-headline numbers are from those of the same scene without a reconstruction, at the finest setting.
+headline numbers are from those of the same scene without a reconstruction, at the finest setting. The network that is twice as deep is that
+of docs/experiments/references.md, trained by the command there; its weights do not ship.
 """
 
 from __future__ import annotations
@@ -49,23 +50,28 @@ SETTINGS = {  # name -> setting; what a name does not say is 256x144, cells of 3
     "onefixer, references 0": Setting(FIXED, given=("references=0",)),
     "onefixer, references 1": Setting(FIXED, given=("references=1",)),
     "onefixer, references 4": Setting(FIXED, given=("references=4",)),
+    "onefixer, twice as deep": Setting(FIXED, given=("weights.bundle=DEEP",)),
 }
 FINEST = Setting(TRUE, size=LARGE, halved=FINE)
 PAGE, FIGURE = DOCS / "experiments" / "speed-and-error.md", DOCS / "img" / "closed-loop-pareto.png"
 
 
-def drive(out: Path, paths: Sequence[Path]) -> None:
+def drive(out: Path, paths: Sequence[Path], deep: Path) -> None:
     """Add drives to a file, all settings of a scene before the next scene."""
     known = json.loads(out.read_text()) if out.exists() else {}
+    compiled = set[str]()
     for path in paths:
         rows, warm = known.setdefault(f"{path.parent.name}/{path.stem}", {}), set[str]()
         for name, one in {"": FINEST, **SETTINGS}.items():
             if name in rows:
                 continue
-            if name and one.size not in warm:  # the first drive loads, compiles, degrades the scene and draws what was recorded
-                one_drive(path, 0, "", FIXED, 0.0, (), one.size)
+            # The first drive loads, compiles, degrades the scene and draws what was recorded.
+            if name and (one.size not in warm or one.halved not in compiled):
+                one_drive(path, 0, one.halved, FIXED, 0.0, (), one.size)
                 warm.add(one.size)
-            rows[name] = one_drive(path, 0, one.halved, one.renderer, 0.0, one.given, one.size)
+                compiled.add(one.halved)
+            given = tuple(word.replace("DEEP", str(deep.resolve())) for word in one.given)
+            rows[name] = one_drive(path, 0, one.halved, one.renderer, 0.0, given, one.size)
             print(path.stem, name, rows[name], flush=True)
             write_json(out, known)
 
@@ -162,9 +168,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("drive", "table"))
     parser.add_argument("files", type=Path, nargs="+", help="As above.")
+    parser.add_argument("--deep", type=Path, default=Path("deep.safetensors"), help="Weights of the network twice as deep.")
     given = parser.parse_args()
     if given.what == "drive":
-        drive(given.files[0], given.files[1:] or [Path(one) for one in scenes()])
+        drive(given.files[0], given.files[1:] or [Path(one) for one in scenes()], given.deep)
         return
     points = points_of(json.loads(given.files[0].read_text()))
     PAGE.write_text(put(PAGE.read_text(encoding="utf-8"), "pareto", table(points)), encoding="utf-8")

@@ -129,11 +129,10 @@ def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
 
 def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
     """Colour cells ``(N,)`` of the ground beside the road, ``(N, 3)``: pavement with slabs, then forecourt or grass."""
-    if site.highway:
-        sorts, sort = ((GRASS, 0.20), (GRAVEL, 0.08)), (off < 1.0).astype(np.intp)
-    else:
-        beyond = (FORECOURT, 0.08) if site.scenario.environment.buildings > 0.5 else (GRASS, 0.20)
-        sorts = (GRASS, 0.20), beyond, (PAVEMENT, 0.06)
+    sorts = [(GRASS, 0.20), (GRAVEL, 0.08)]
+    sort = (off < 1.0).astype(np.intp)
+    if not site.highway:
+        sorts[1:] = (FORECOURT, 0.08) if site.scenario.environment.buildings > 0.5 else (GRASS, 0.20), (PAVEMENT, 0.06)
         sort = (off < FORECOURT_M).astype(np.intp) + (off < PAVEMENT_M)
     colours, contrast = (np.array(column, dtype=np.float32) for column in zip(*((c, k * texture) for c, k in sorts), strict=True))
     rgb = colours[sort] * (1 + contrast[sort] * grain)[:, None]
