@@ -153,7 +153,9 @@ def draw(points: Mapping[str, Point], out: Path) -> None:
         spans = ((error, error_half, error_half), (rate, rate - 100 * low, 100 * high - rate))
         look = {"marker": "X" if where == "behind" else "o", "mfc": "white" if where.startswith("undecided") else None}
         for ax, (y, down, up) in zip(axes, spans, strict=True):
-            ax.errorbar(ms, y, [[down], [up]], [[half], [half]], color=f"C{k}", capsize=3, lw=1, ls="", label=name, **look)
+            ax.errorbar(
+                ms, y, [[down], [up]], [[half], [half]], color=f"C{k}" if k < 10 else "black", capsize=3, lw=1, ls="", label=name, **look
+            )
     for ax, what in zip(axes, (f"|change of {DISTANCE}|, m", "drives whose event is another, %"), strict=True):
         ax.set(xlabel="processor ms a frame", ylabel=what, ylim=(None if "event" in what else 0, None), xlim=(0, None))
         ax.grid(alpha=0.3)
