@@ -29,9 +29,10 @@ DOING = "reading a recorded photograph"
 SIDE_PX = 16
 INTERVAL_US, FIRST_US = 500_000, 50_000  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
 POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
-KEPT_SHOTS = 48  # rendered pictures that a built scene's recording keeps: 50 MB of 512x288
+KEPT_BYTES = 50_000_000  # of rendered pictures and depths that a built scene's recording keeps: 48 of 512x288, three of 1920x1080
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
+BYTES_PER_PX = 7  # three of colour, four of depth
 Model = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]  # renders a view of the reconstruction
 DepthFrom = Callable[[PinholeCamera, Mapping[str, F64]], F32]  # camera, actor poses -> depth (H, W) metres, 0 where there is none
 
@@ -72,7 +73,8 @@ def built_recording(scenario: Scenario, scene: SceneGraph, model: Model, recipe:
         errors = pose_errors(scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, recipe.splat.views, at)
     aside = np.eye(4)
     aside[1, 3] = recipe.aside_m if recipe else 0.0
-    read = lru_cache(maxsize=KEPT_SHOTS)(_Shot.read)
+    largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
+    read = lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))(_Shot.read)
     return tuple(
         _frame(scenario, scene, model, read, spec, t_us, interpolate(log, t_us) @ aside @ spec.T_rig_camera, error)
         for t_us, error in zip(times, errors, strict=True)

@@ -15,7 +15,7 @@ from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import BackgroundFile, Behaviour, Degradation, Environment, Latency, Scenario
 from alpasim_plugin.gaussians.fit.views import logged_views
-from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.renderers import make_renderer, recorded
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache, scene_of
 from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
 from alpasim_plugin.renderers.reconstruction_build import misplaced
@@ -100,6 +100,20 @@ def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(fitte
     assert (first, other) == tuple(again)
     assert again[0].read() is first.read()
     assert other.read() is not first.read()
+
+
+def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted: ReconstructionRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorded, "KEPT_BYTES", 2 * 64 * 36 * recorded.BYTES_PER_PX)
+    scene, model = scene_of(fitted.scenario), fitted.model.graph.render
+    first, second, third = recorded.built_recording(fitted.scenario, scene, model, recipe_of(fitted.scenario))[:3]
+    was = first.read()
+    second.read()
+    assert first.read() is was
+    third.read()
+    second.read()  # now the first is the one that was not read for longest
+    again = first.read()
+    assert again is not was
+    np.testing.assert_array_equal(again[0], was[0])
 
 
 def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(fitted: ReconstructionRenderer) -> None:
