@@ -138,22 +138,6 @@ def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
     return CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1]))
 
 
-def gradient(values: F64) -> F64:
-    """Return the differences ``(N, ...)`` of values one apart, central and at the ends one-sided: `numpy.gradient` without its overhead."""
-    out = np.empty_like(values)
-    np.subtract(values[2:], values[:-2], out=out[1:-1])
-    out[1:-1] /= 2.0
-    out[0], out[-1] = values[1] - values[0], values[-1] - values[-2]
-    return out
-
-
-def headings(step: F64) -> F64:
-    """Return the headings ``(N,)`` of steps ``(N, 2)`` along a line, without jumps of a whole turn."""
-    heading = np.arctan2(step[:, 1], step[:, 0])
-    jumps = np.abs(heading[1:] - heading[:-1]) >= np.pi
-    return np.unwrap(heading) if jumps.any() else np.asarray(heading)
-
-
 def extended(points: F64, length_m: float) -> F64:
     """Return a line through points ``(M, 2)``, one every `Path.SPACING_M`, that goes straight on up to ``length_m``."""
     s = arc_lengths(points)
@@ -176,16 +160,17 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
         speed_mps: At which it will be driven.
     """
     xy = extended(points, length_m)
-    heading = headings(gradient(xy))
+    step = np.gradient(xy, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     half = round(max(5.0, SMOOTH_S * speed_mps) / Path.SPACING_M / 2)
     kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
     padded = np.concatenate([np.full(half, heading[0]), heading, np.full(half, heading[-1])])
-    return Path(xy, gradient(np.convolve(padded, kernel, mode="valid")) / Path.SPACING_M)
+    return Path(xy, np.gradient(np.convolve(padded, kernel, mode="valid"), Path.SPACING_M))
 
 
 def shifted(line: F64, left_m: float) -> F64:
     """Return a line ``(M, 2)`` shifted to the left."""
-    step = gradient(line)
+    step = np.gradient(line, axis=0)
     normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
     return np.asarray(line + left_m * normal)
 

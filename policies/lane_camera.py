@@ -19,7 +19,6 @@ from policies.base import (
     extended,
     follow,
     front_camera,
-    gradient,
     plan_times,
     route_left,
     seconds,
@@ -100,7 +99,7 @@ class LaneCamera(Policy):
         left = route_left(observation.route_rig)
         if left is not None:  # with a lateral navigation error that is constant over the drive
             line = smooth_line(left)
-            step = gradient(line)
+            step = np.gradient(line, axis=0)
             normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
             route = line + self.navigation_error_m * normal
         speed = observation.ego.speed_mps

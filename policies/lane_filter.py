@@ -113,7 +113,7 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     rows = row_m[near]
     left, right = _length(x, rows, used & (side > 0)), _length(x, rows, used & (side < 0))
     seen = left + right > 2.0
-    far = _percentile_95(x[used]) if seen else lane.seen_to_m
+    far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
     return LaneState(mean, np.asarray(np.linalg.inv(total)), left, right, max(far, 0.0), 0.0 if seen else lane.blind_m)
 
 
@@ -188,14 +188,6 @@ def _length(x: F64, rows: F64, used: Bool) -> float:
     is_new = np.ones(len(at), dtype=bool)
     np.not_equal(at[1:], at[:-1], out=is_new[1:])
     return float(rows[used][is_new].sum())
-
-
-def _percentile_95(x: F64) -> float:
-    """Return what `numpy.percentile` does of increasing values, to the bit and in a twentieth of its time."""
-    at = (len(x) - 1) * 0.95
-    low, share = int(at), at - int(at)
-    a, b = float(x[low]), float(x[min(low + 1, len(x) - 1)])
-    return a + (b - a) * share if share < 0.5 else b - (b - a) * (1 - share)
 
 
 def _basis(x: F64) -> F64:

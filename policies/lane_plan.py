@@ -9,7 +9,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64
-from policies.base import Path, gradient, headings, make_path
+from policies.base import Path, make_path
 from policies.lane_filter import LaneState
 from policies.obstacle_vision import ObstacleTrack
 
@@ -46,10 +46,7 @@ def route_prior(points: F64) -> RoutePrior:
     x, y = near[:, 0], near[:, 1]
     if x[-1] - x[0] < 5.0:
         return RoutePrior(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
-    powers = np.ones((len(x), 3))  # `numpy.polyfit`, to the bit, without its checks
-    powers[:, 0], powers[:, 1] = x * x, x
-    scale = np.sqrt((powers * powers).sum(axis=0))
-    half_curvature, heading, offset = np.linalg.lstsq(powers / scale, y, len(x) * np.finfo(np.float64).eps)[0] / scale
+    half_curvature, heading, offset = np.polyfit(x, y, 2)
     return RoutePrior(float(offset), float(heading), float(2 * half_curvature))
 
 
@@ -87,8 +84,8 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
         return np.stack([x, y], axis=1), 0.0, np.inf
     s = arc_lengths(route)
     points = resample(route, np.arange(0.0, max(float(s[-1]), 2.0), 1.0), s)
-    step = gradient(points)
-    heading = headings(step)
+    step = np.gradient(points, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     x, y = points[:, 0], points[:, 1]
     usable = _prefix((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))
     y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))

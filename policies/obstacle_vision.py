@@ -55,20 +55,14 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
     patch = patch[grid.inside[rows[:, None], index].reshape(-1)]
     if len(patch) < 50:
         return colour
-    middle = _median(patch)
-    spread = 1.4826 * _median(np.abs(patch - middle))
+    middle = np.median(patch, axis=0)
+    spread = 1.4826 * np.median(np.abs(patch - middle), axis=0)
     new = RoadColour(middle, np.maximum(np.array([22.0, 7.0, 7.0]), 4.0 * spread))
     if colour is None:
         return new
     # A sudden change is more likely an obstacle than a new road surface: adapt slowly.
     step = np.clip(new.centre - colour.centre, -20.0, 20.0)
     return RoadColour(colour.centre + LEARN * step, colour.tolerance + LEARN * (new.tolerance - colour.tolerance))
-
-
-def _median(rows: F64) -> F64:
-    """Return the median ``(D,)`` of rows ``(N, D)``: `numpy.median` of few columns, in a third of its time."""
-    columns, n = np.sort(rows.T), len(rows)
-    return np.asarray((columns[:, (n - 1) // 2] + columns[:, n // 2]) / 2.0)
 
 
 def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:

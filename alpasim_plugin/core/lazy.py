@@ -52,7 +52,7 @@ def require_library(module: str, doing: str, with_what: str, do_this: str) -> An
 
 
 class _NoPandas:
-    """A finder by which pandas is not installed."""
+    """A finder by which pandas is not installed; nothing in its place in `sys.modules`, where libraries look for its classes."""
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> None:

@@ -174,9 +174,10 @@ def scene_key(scenario: Scenario) -> str:
     return digest.hexdigest()
 
 
-def clear_cache() -> None:
-    """Forget all built scenes."""
-    _cache.clear()
+def clear_cache(kind: str = "") -> None:
+    """Forget what was built, or what is kept under keys that begin with ``kind``."""
+    for key in [key for key in _cache if key.startswith(kind)]:
+        del _cache[key]
 
 
 def _build(scenario: Scenario) -> SceneGraph:

@@ -98,14 +98,8 @@ def ground_pose(field: HeightField, x: float, y: float, yaw: float) -> F64:
     z = height_at(field, np.array([x, y]) + offsets)
     along, across = (z[1] - z[2]) / (2 * h), (z[3] - z[4]) / (2 * h)
     ex = np.array([c, s, along]) / np.sqrt(1 + along * along)
-    ez = _cross(ex, np.array([-s, c, across]))
+    ez = np.cross(ex, np.array([-s, c, across]))
     ez /= np.linalg.norm(ez)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = ex, _cross(ez, ex), ez, (x, y, z[0])
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = ex, np.cross(ez, ex), ez, (x, y, z[0])
     return pose
-
-
-def _cross(a: F64, b: F64) -> F64:
-    """Return the cross product of two vectors (3,): `numpy.cross`, whose overhead is ten times the work."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

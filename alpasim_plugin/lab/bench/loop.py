@@ -23,7 +23,7 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.places import temporary_folder
 from alpasim_plugin.lab.bench.fixer_drive import RecordingRenderer
-from alpasim_plugin.renderers import gaussian
+from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.runtime.cell import make_renderer
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.recorder import Recorder
@@ -134,9 +134,7 @@ def frame_cost(renderer: str, scenario: Scenario, repeats: int) -> FrameCost:
     """Drive a scene several times behind a renderer, on one thread, and judge what the policy saw."""
     drives: list[dict[str, list[float]]] = []
     for _ in range(repeats):
-        # Each drive reads its photographs, as the first of a scene does, though a process keeps them.
-        for key in [key for key in gaussian._cache if key.startswith("recording:")]:
-            del gaussian._cache[key]
+        clear_cache("recording:")  # each drive reads its photographs, as the first of a scene does
         recording = RecordingRenderer(make_renderer(renderer, scenario, threads=1))
         # On a busy machine the time that passes is others' too: the stages' clock is this process's own.
         with patch.object(time, "perf_counter", time.process_time), Recorder(scenario, images="png") as recorder:

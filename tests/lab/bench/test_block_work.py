@@ -82,8 +82,8 @@ def test_measuring_gives_every_stage():
     assert (times.calls, times.peak_mb, times.device) == ({}, None, "cpu")
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
-def test_absent_gpu_is_an_error_before_anything_is_made():
+def test_absent_gpu_is_an_error_before_anything_is_made(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     settings = fixer_settings("onefixer-2b")
     work = block_work(small_settings(), 32, 48, text_tokens=1)
     with pytest.raises(FixerError, match=r"measuring onefixer-2b[\s\S]*sees no CUDA device[\s\S]*--device cpu"):
