@@ -27,7 +27,7 @@ COPY simrun simrun
 COPY docs docs
 RUN /opt/simrun/bin/pip install .
 # Kernels for the levels of processors that the building machine runs; other processors compile theirs at their first run.
-RUN /opt/simrun/bin/python -P -m alpasim_plugin.plugins.kernels
+RUN /opt/simrun/bin/python -P -m alpasim_plugin.core.kernels
 
 FROM ${BASE}
 SHELL ["/bin/sh", "-euc"]

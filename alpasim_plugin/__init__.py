@@ -10,14 +10,14 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from alpasim_plugin.core import places
 from alpasim_plugin.core.lazy import lazy_names
-from alpasim_plugin.io import places
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.driver_service import serve_policy
-    from alpasim_plugin.notebook import open_run
-    from alpasim_plugin.runtime.cell import make_renderer
-    from alpasim_plugin.runtime.rollout import run_rollout
+    from alpasim_plugin.runs.cell import make_renderer
+    from alpasim_plugin.runs.notebook import open_run
+    from alpasim_plugin.runs.rollout import run_rollout
     from policies import make_policy
     from scenarios.load import load_scenario
 
@@ -61,9 +61,9 @@ __getattr__ = lazy_names(
     {
         "load_scenario": "scenarios.load",
         "make_policy": "policies",
-        "make_renderer": ".runtime.cell",
-        "open_run": ".notebook",
-        "run_rollout": ".runtime.rollout",
+        "make_renderer": ".runs.cell",
+        "open_run": ".runs.notebook",
+        "run_rollout": ".runs.rollout",
         "serve_policy": ".alpasim.server.driver_service",
     },
 )

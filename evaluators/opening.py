@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path
 
-from alpasim_plugin.run_folder import reader
-from alpasim_plugin.run_folder.reader import RunSoFar
-from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE
+from alpasim_plugin.log.run_folder import reader
+from alpasim_plugin.log.run_folder.reader import RunSoFar
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE
 from evaluators.metrics import MetricTable
 
 
@@ -26,7 +26,7 @@ class Run(reader.Run):
 
 
 def read_run(run_dir: Path | str | Run) -> Run:
-    """Read a run folder, whose rates must lie in [0, 1]; see `alpasim_plugin.run_folder.reader.read_run`.
+    """Read a run folder, whose rates must lie in [0, 1]; see `alpasim_plugin.log.run_folder.reader.read_run`.
 
     A run that was read is returned as it is.
     """
@@ -38,6 +38,6 @@ def read_run(run_dir: Path | str | Run) -> Run:
 
 
 def read_so_far(root: Path) -> RunSoFar[Run]:
-    """Read a run folder that may still be written; see `alpasim_plugin.run_folder.reader.read_so_far`."""
+    """Read a run folder that may still be written; see `alpasim_plugin.log.run_folder.reader.read_so_far`."""
     found = reader.read_so_far(root)
     return RunSoFar(Run.of(found.run), found.planned, found.damage, found.finished)

@@ -11,9 +11,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import CubicSpline, arc_lengths, resample
+from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.plugins.parts import build, unidentified
 
 PLAN_HORIZON_S = 5.0  # AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four metrics
 PLAN_STEP_US = 100_000
@@ -23,7 +23,7 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
     """Return a policy for a scenario.
 
     Args:
-        name: A policy as `alpasim_plugin.plugins.parts.resolve` takes it: a registered name, ``package.module:Class`` or ``file.py:Class``.
+        name: A policy as `alpasim_plugin.core.parts.resolve` takes it: a registered name, ``package.module:Class`` or ``file.py:Class``.
         scenario: What the policy will drive in. A policy under test should take no more from it than its cameras.
 
     Raises:

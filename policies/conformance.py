@@ -18,9 +18,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.plan_check import blank_scenario, sensors_problem, shape_problem, unit_guess
 from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario
-from alpasim_plugin.plugins.interfaces import Policy
 from policies.base import make_policy
 from policies.painted_road import PaintedRoad, pinhole_camera
 

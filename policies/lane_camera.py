@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Route, Scenario, SensorSpec
-from alpasim_plugin.plugins.interfaces import Policy
 from policies.base import (
     Path,
     camera_frame,

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, Observation, Plan, Route, Scenario, SensorSpec
-from alpasim_plugin.plugins.interfaces import Policy
 from policies.base import MIN_CRUISE_MPS, camera_frame, front_camera, plan_times, seconds
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, correlated_noise, sampled
 from policies.learned_input import COMMANDS, level_view, network_input, route_command

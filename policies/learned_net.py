@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import check_regular, parsing
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.io.atomic import write_safetensors
-from alpasim_plugin.io.reading import check_regular, parsing
 from policies.learned_input import CHANNELS, COMMANDS, HEIGHT, WIDTH
 
 KNOTS_M = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0, 42.0, 60.0)  # distances along the path of the predicted headings

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec
-from alpasim_plugin.plugins.interfaces import Policy
 from policies.base import MIN_CRUISE_MPS, curve_speeds, follow, make_path, plan_times, route_points, seconds, smooth_line, speed_profile
 
 

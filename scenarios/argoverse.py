@@ -16,8 +16,8 @@ import numpy.typing as npt
 import shapely
 
 from alpasim_plugin.core.geometry import centre_line, matrix_from_quat, quat_from_matrix, se3, wrap_angle
+from alpasim_plugin.core.reading.tables import Kind
 from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, HeightField, Lane, LaneMap, Paint, Trajectory, Vehicle
-from alpasim_plugin.io.reading.tables import Kind
 from alpasim_plugin.world.ground import from_points
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory

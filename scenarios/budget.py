@@ -1,7 +1,7 @@
 """What a scenario may hold and cost, computed before anything is built: the one gate that every source passes.
 
 `check_specification` looks at a built road's file before the road is made, `check_record` at what a reader returned, `check_scenario` at
-the finished scenario of either kind. Ranges of single quantities are in `alpasim_plugin.io.limits`.
+the finished scenario of either kind. Ranges of single quantities are in `alpasim_plugin.core.limits`.
 
 The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km (docs/reliability.md): ground and kerbs by the drive's
 length, trees and walls by the surroundings.
@@ -13,10 +13,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, Environment, LaneMap, Scenario, Trajectory
-from alpasim_plugin.io import limits as b
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import IdmActor, NarrowGapSegment, ParkedActor
 from scenarios.variation import Drawn

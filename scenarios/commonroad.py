@@ -18,8 +18,8 @@ import shapely
 
 from alpasim_plugin.core.geometry import offset_trajectory, quat_from_yaw, rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.limits import STEP, TIME_STEP_S
 from alpasim_plugin.core.types import F64, I64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
-from alpasim_plugin.io.limits import STEP, TIME_STEP_S
 from alpasim_plugin.world.ground import flat, from_points
 from scenarios.commonroad_map import number, point, read_lanelets
 from scenarios.map_lines import lane_edges, merge_areas, predecessors

@@ -15,6 +15,10 @@ from typing import Any, Literal, NotRequired
 import numpy as np
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.atomic import write_array, write_json
+from alpasim_plugin.core.reading import check_regular
+from alpasim_plugin.core.reading.arrays import open_npy
+from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -29,10 +33,6 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
-from alpasim_plugin.io.atomic import write_array, write_json
-from alpasim_plugin.io.reading import check_regular
-from alpasim_plugin.io.reading.arrays import open_npy
-from alpasim_plugin.io.reading.files import as_shape
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory, stands_still
 
 DRIVE_FILE, TRANSFORMS_FILE, GROUND_FILE, MODEL_FOLDER = "drive.json", "transforms.json", "ground.npy", "model"

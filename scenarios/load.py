@@ -13,6 +13,9 @@ import numpy as np
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import speeds
+from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.parts.spec import digest
+from alpasim_plugin.core.reading import check_regular
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -27,9 +30,6 @@ from alpasim_plugin.core.types import (
     Scenario,
     Vehicle,
 )
-from alpasim_plugin.io.reading import check_regular
-from alpasim_plugin.plugins.parts.source import own_code_digest
-from alpasim_plugin.plugins.parts.spec import digest
 from alpasim_plugin.world.paint import with_default_paint
 from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_scenario

@@ -17,8 +17,8 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import densify, transform_points
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.limits import ASIDE_M
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
-from alpasim_plugin.io.limits import ASIDE_M
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
 from scenarios.opendrive_road import (
     MAX_ROAD_M,

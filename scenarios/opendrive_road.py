@@ -14,8 +14,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.core.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.io.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
 from scenarios.recorded import SourceFiles
 
 Kind = Literal["line", "arc", "spiral", "poly3", "paramPoly3"]

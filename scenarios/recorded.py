@@ -19,7 +19,12 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
+from alpasim_plugin.core import reading
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import COORDINATE_M, MEMBERS, SOURCE_BYTES
+from alpasim_plugin.core.reading.arrays import parse_npy
+from alpasim_plugin.core.reading.files import parse_xml
+from alpasim_plugin.core.reading.tables import Kind, check_columns
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -34,11 +39,6 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
-from alpasim_plugin.io import reading
-from alpasim_plugin.io.limits import COORDINATE_M, MEMBERS, SOURCE_BYTES
-from alpasim_plugin.io.reading.arrays import parse_npy
-from alpasim_plugin.io.reading.files import parse_xml
-from alpasim_plugin.io.reading.tables import Kind, check_columns
 
 MAX_REACH_M = COORDINATE_M.high
 

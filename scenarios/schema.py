@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from alpasim_plugin.io import limits as b
+from alpasim_plugin.core import limits as b
 from scenarios.schema_parts import ActorSpec, BuildingHeight, LogSpec, Part, RoadSpec, within
 
 SCHEMA_FILE = Path(__file__).with_name("schema.json")

@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from alpasim_plugin.io import limits as bounds
-from alpasim_plugin.io.limits import Bound, number
+from alpasim_plugin.core import limits as bounds
+from alpasim_plugin.core.limits import Bound, number
 from scenarios import budget
 from scenarios.schema import models
 from scenarios.schema_parts import Part

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.io import limits as b
+from alpasim_plugin.core import limits as b
 
 
 def within(bound: b.Bound, description: str | None = None, default: Any = ...) -> Any:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from alpasim_plugin.core.config import Document, load_yaml
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.config import Document, load_yaml
-from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.plugins.interfaces import Source
-from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
+from alpasim_plugin.core.interfaces import Source
+from alpasim_plugin.core.parts import PartSpec, build, names, resolve
+from alpasim_plugin.core.reading import parsing
 from scenarios.budget import check_record
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
@@ -104,7 +104,7 @@ def open_document(path: Path, source: str | None) -> Document:
 
     Args:
         path: File or folder, which exists.
-        source: Who reads it, as `alpasim_plugin.plugins.parts.resolve` takes it; None finds out.
+        source: Who reads it, as `alpasim_plugin.core.parts.resolve` takes it; None finds out.
 
     Raises:
         InputError: Nothing recognises the path, the file is broken, or it is a suite.

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
+from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.config import Document, load_yaml, validate
-from alpasim_plugin.io.limits import LISTED, SEED, SEEDS
-from alpasim_plugin.io.reading import exists
+from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
+from alpasim_plugin.core.reading import exists
 from scenarios.schema_parts import Part, within
 from scenarios.sources import source_of
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from alpasim_plugin.io.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
-from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.files import check_names, open_regular
-from alpasim_plugin.io.reading.tables import parse_parquet
-from alpasim_plugin.io.yaml_positions import parse
+from alpasim_plugin.core.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
+from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.reading.files import check_names, open_regular
+from alpasim_plugin.core.reading.tables import parse_parquet
+from alpasim_plugin.core.yaml_positions import parse
 from scenarios.recorded import SourceFiles
 
 

@@ -17,10 +17,10 @@ import numpy as np
 import yaml
 
 from alpasim_plugin import __version__
+from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import F64, Actor, CameraSpec, HeightField, Scenario, Trajectory, Vehicle
-from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.world.ground import height_at
 from scenarios.cosmos_camera import FRONT_WIDE, calibration_table
 from scenarios.usdz_tables import map_tables

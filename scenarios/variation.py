@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.config import Document, apply_overrides, dotted, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.io.config import Document, apply_overrides, dotted, validate
 from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
 from scenarios.schema_parts import Part
 

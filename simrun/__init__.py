@@ -27,9 +27,9 @@ if TYPE_CHECKING:
         SensorSpec,
         Trajectory,
     )
-    from alpasim_plugin.notebook import open_run
-    from alpasim_plugin.runtime.cell import make_renderer
-    from alpasim_plugin.runtime.rollout import run_rollout
+    from alpasim_plugin.runs.cell import make_renderer
+    from alpasim_plugin.runs.notebook import open_run
+    from alpasim_plugin.runs.rollout import run_rollout
     from evaluators import aggregate, paired, reduce_rollout, resolve_evaluators, rollout_values, score, series
     from policies import check_policy, make_policy
     from policies.base import plan_times
@@ -42,9 +42,9 @@ HOMES = {
         "CameraSpec", "EgoState", "Frame", "MetricInfo", "MetricSeries", "Observation", "Plan", "RenderRequest", "RolloutLog", "Route",
         "Scenario", "Scene", "SensorSpec", "Trajectory", "U8",
     ],
-    "alpasim_plugin.notebook": ["open_run"],
-    "alpasim_plugin.runtime.cell": ["make_renderer"],
-    "alpasim_plugin.runtime.rollout": ["run_rollout"],
+    "alpasim_plugin.runs.notebook": ["open_run"],
+    "alpasim_plugin.runs.cell": ["make_renderer"],
+    "alpasim_plugin.runs.rollout": ["run_rollout"],
     "evaluators": ["aggregate", "paired", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series"],
     "policies": ["check_policy", "make_policy"],
     "policies.base": ["plan_times"],

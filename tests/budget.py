@@ -1,7 +1,8 @@
-"""The size of the project by room, and how a change moves it: ``python -m tests.budget [--against REV] [--json]``.
+"""The size of the project by room: ``python -m tests.budget [--against REV] [--json] [--check]``.
 
-Lines and syntax nodes count what a reader has to hold; modules and the share of import lines count the journeys between. The numbers stand
-in docs/architecture.md, whose first row is the project before it had rooms.
+Syntax nodes and statements count what a reader has to hold; lines do not, since they depend on the
+format. ``--check`` compares the core with the record in ``tests/budget.json`` and fails if the core
+has grown. A change that needs more raises the record in the same commit and says why there.
 """
 
 from __future__ import annotations
@@ -9,17 +10,20 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+import re
 import statistics
 import subprocess
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[1]
-PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios")
-PLUG_INS = ("alpasim_plugin/block_fixers", "alpasim_plugin/lab")
+RECORD = Path(__file__).with_name("budget.json")
+PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "simrun", "tests")
+LABORATORY = "alpasim_plugin/lab"
+TESTS = "tests"
 
 
 @dataclass
@@ -28,22 +32,29 @@ class Size:
 
     modules: int = 0
     lines: int = 0
-    imports: int = 0
     nodes: int = 0
     statements: int = 0
-    functions: list[int] = field(default_factory=list)  # lines of each
+    function_lines: list[int] = field(default_factory=list)
+    private_functions: set[str] = field(default_factory=set)
+    names: Counter[str] = field(default_factory=Counter)
 
     def add(self, text: str) -> None:
         """Count a module."""
-        nodes = [node for node in ast.walk(ast.parse(text)) if not isinstance(node, ast.expr_context)]
+        tree = ast.walk(ast.parse(text))
+        nodes = [node for node in tree if not isinstance(node, ast.expr_context)]
         self.modules += 1
         self.lines += len(text.splitlines())
-        self.imports += sum(isinstance(node, ast.Import | ast.ImportFrom) for node in nodes)
         self.nodes += len(nodes)
         self.statements += sum(isinstance(node, ast.stmt) for node in nodes)
         for node in nodes:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                self.functions.append((node.end_lineno or node.lineno) - node.lineno + 1)
+                self.function_lines.append((node.end_lineno or node.lineno) - node.lineno + 1)
+                if re.match(r"_[a-z]", node.name):
+                    self.private_functions.add(node.name)
+            elif isinstance(node, ast.Name):
+                self.names[node.id] += 1
+            elif isinstance(node, ast.Attribute):
+                self.names[node.attr] += 1
 
     def row(self) -> dict[str, float]:
         """Return the numbers of the table."""
@@ -51,14 +62,17 @@ class Size:
             "modules": self.modules,
             "lines": self.lines,
             "nodes": self.nodes,
+            "statements": self.statements,
             "nodes_per_statement": round(self.nodes / max(self.statements, 1), 1),
-            "import_share": round(self.imports / max(self.lines, 1), 3),
-            "median_function": statistics.median(self.functions) if self.functions else 0,
+            "median_function": statistics.median(self.function_lines or [0]),
+            "private_functions_used_once": sum(
+                self.names[name] == 1 for name in self.private_functions
+            ),
         }
 
 
 def room_of(path: str) -> str:
-    """Return the room of a module: the folder below the package, or the package."""
+    """Return the room of a module: the folder below alpasim_plugin, or the package."""
     parts = path.split("/")
     return "/".join(parts[:2]) if parts[0] == "alpasim_plugin" and len(parts) > 2 else parts[0]
 
@@ -70,33 +84,55 @@ def sources(rev: str | None) -> Iterator[tuple[str, str]]:
             for path in sorted((REPO / package).rglob("*.py")):
                 yield path.relative_to(REPO).as_posix(), path.read_text()
         return
-    listed = git("ls-tree", "-r", "--name-only", rev, "--", *PACKAGES)
-    for name in listed.splitlines():
+    for name in git("ls-tree", "-r", "--name-only", rev, "--", *PACKAGES).splitlines():
         if name.endswith(".py"):
             yield name, git("show", f"{rev}:{name}")
 
 
 def git(*arguments: str) -> str:
-    return subprocess.run(["git", *arguments], cwd=REPO, check=True, capture_output=True, text=True).stdout
+    """Return what a git command prints."""
+    done = subprocess.run(["git", *arguments], cwd=REPO, check=True, capture_output=True, text=True)
+    return done.stdout
 
 
 def sizes(rev: str | None = None) -> dict[str, Size]:
-    """Return the size of each room, and the sums ``core`` (without the plug-in rooms) and ``all``."""
-    found: dict[str, Size] = defaultdict(Size)
+    """Return the size of each room and of ``core``: everything but the laboratory and the tests."""
+    rooms: dict[str, Size] = defaultdict(Size)
     for path, text in sources(rev):
         if path.endswith("_pb2.py"):
             continue
         room = room_of(path)
-        for name in (room, "all", *(() if room in PLUG_INS else ("core",))):
-            found[name].add(text)
-    return dict(found)
+        rooms[room].add(text)
+        if room not in (LABORATORY, TESTS):
+            rooms["core"].add(text)
+    return dict(rooms)
 
 
-def options_of_the_core() -> tuple[int, int]:
+def command_line_of_the_core() -> tuple[int, int]:
     """Return how many verbs and options the core's command line has."""
     from tests.cli.test_verbs import CORE, options_of
 
     return len(CORE), sum(len(options_of(command)) for command in CORE.values())
+
+
+def summary(rooms: dict[str, Size]) -> dict[str, int]:
+    """Return the numbers that the record limits."""
+    verbs, options = command_line_of_the_core()
+    laboratory = rooms.get(LABORATORY, Size())
+    return {
+        "core_nodes": rooms["core"].nodes,
+        "core_statements": rooms["core"].statements,
+        "laboratory_nodes": laboratory.nodes,
+        "tests_nodes": rooms[TESTS].nodes,
+        "verbs": verbs,
+        "options": options,
+    }
+
+
+def grown(now: dict[str, int]) -> list[str]:
+    """Return a line for every number that is above its record."""
+    record = json.loads(RECORD.read_text())["limits"]
+    return [f"{name}: {now[name]}, record {record[name]}" for name in record if now[name] > record[name]]
 
 
 def main() -> None:
@@ -104,22 +140,34 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--against", help="Commit to compare with.")
     parser.add_argument("--json", action="store_true", help="Print one JSON document.")
-    given = parser.parse_args()
-    now = {room: size.row() for room, size in sorted(sizes().items())}
-    before = {room: size.row() for room, size in sizes(given.against).items()} if given.against else {}
-    verbs, options = options_of_the_core()
-    if given.json:
-        json.dump({"rooms": now, "before": before, "verbs": verbs, "options": options}, sys.stdout, indent=1)
+    parser.add_argument("--check", action="store_true", help="Fail if the core has grown.")
+    arguments = parser.parse_args()
+    rooms = sizes()
+    rows = {room: size.row() for room, size in sorted(rooms.items())}
+    before = {}
+    if arguments.against:
+        before = {room: size.row() for room, size in sizes(arguments.against).items()}
+    now = summary(rooms)
+    if arguments.json:
+        json.dump({"rooms": rows, "before": before, "summary": now}, sys.stdout, indent=1)
         return
-    last = f"  lines against {given.against}" if before else ""
-    print(f"{'room':28}{'modules':>9}{'lines':>8}{'nodes':>9}{'/stmt':>7}{'imports':>9}{'median':>8}{last}")
-    for room, row in now.items():
-        change = f"{row['lines'] - before.get(room, {'lines': 0})['lines']:+16.0f}" if before else ""
+    print(
+        f"{'room':28}{'modules':>9}{'lines':>8}{'nodes':>9}{'statements':>12}{'/stmt':>7}"
+        f"{'median':>8}{'used once':>11}" + (f"  nodes against {arguments.against}" if before else "")
+    )
+    for room, row in rows.items():
         print(
-            f"{room:28}{row['modules']:9.0f}{row['lines']:8.0f}{row['nodes']:9.0f}{row['nodes_per_statement']:7.1f}"
-            f"{row['import_share']:9.1%}{row['median_function']:8.0f}{change}"
+            f"{room:28}{row['modules']:9.0f}{row['lines']:8.0f}{row['nodes']:9.0f}"
+            f"{row['statements']:12.0f}{row['nodes_per_statement']:7.1f}"
+            f"{row['median_function']:8.0f}{row['private_functions_used_once']:11.0f}"
+            + (f"{row['nodes'] - before.get(room, {'nodes': 0})['nodes']:+16.0f}" if before else "")
         )
-    print(f"core command line: {verbs} verbs, {options} options")
+    print(f"command line of the core: {now['verbs']} verbs, {now['options']} options")
+    lines = grown(now) if arguments.check else []
+    if lines:
+        print(*lines, sep="\n")
+        print(f"The core has grown. Delete as much, or raise {RECORD.name} and say why there.")
+        sys.exit(1)
 
 
 if __name__ == "__main__":

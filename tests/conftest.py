@@ -44,7 +44,7 @@ def pytest_configure(config: pytest.Config) -> None:
 # measured, so that no worker is left alone with it at the end.
 FIRST = (
     "tests/gaussians/test_rasterize_hard_cases.py",
-    "tests/semantic_map/test_draw.py",
+    "tests/fixers/test_draw.py",
     "tests/gaussians/test_gradient_gsplat.py",
 )
 

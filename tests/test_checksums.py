@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.core import checksums
+from alpasim_plugin.core.checksums import checksums_of, problem_of, read_sealed, write_sealed
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io import checksums
-from alpasim_plugin.io.checksums import checksums_of, problem_of, read_sealed, write_sealed
 
 CONTENT = {"metrics": {"progress": 0.5}, "files": [1, 2], "name": "é"}
 

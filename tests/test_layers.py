@@ -15,27 +15,22 @@ REPO = Path(__file__).resolve().parents[1]
 A = "alpasim_plugin."
 
 # The rooms in the order in which data flows, and what each may import besides itself and `BASE`.
-BASE = (A + "core", A + "io", A + "process", A + "plugins")
+BASE = (A + "core",)
 STAGES: dict[str, tuple[str, ...]] = {
     A + "world": (),
     A + "gaussians": (A + "world",),
     "scenarios": (A + "world",),
-    A + "nets": (),
-    A + "semantic_map": (A + "gaussians", A + "world"),
     A + "renderers": (A + "gaussians", A + "world"),
     A + "drives": (A + "gaussians", A + "world", "scenarios"),
-    A + "fixers": (A + "gaussians", A + "world", A + "nets", A + "semantic_map"),
+    A + "fixers": (A + "gaussians", A + "world"),
     "policies": (),
     A + "control": (),
-    A + "wire": (),
-    A + "log": (A + "wire",),
-    A + "alpasim.client": (A + "world", A + "control", A + "wire", A + "log"),  # parts that are a service's
-    A + "run_folder": (A + "log",),
-    "evaluators": (A + "run_folder",),
-    A + "viewer": (A + "log", A + "run_folder", "evaluators"),
+    A + "log": (),
+    A + "alpasim.client": (A + "world", A + "control", A + "log"),  # parts that are a service's
+    "evaluators": (A + "log",),
 }
 # These compose the stages: each may import everything that stands before it, but no plug-in room.
-AFTER_THE_STAGES = (A + "runtime", A + "alpasim", A + "gym", A + "recordings", A + "notebook", A + "cli")
+AFTER_THE_STAGES = (A + "runs", A + "alpasim", A + "gym", A + "cli")
 # Rooms that register themselves by entry points, as another distribution does. Nobody imports them.
 PLUG_INS = (A + "block_fixers", A + "lab")
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "simrun")

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.interfaces import Fixer, Renderer
 from alpasim_plugin.core.types import Frame, RenderRequest
 from alpasim_plugin.fixers.loop import BlockRunner
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.plugins.interfaces import Fixer, Renderer
 
 
 class ChunkRenderer(Renderer):

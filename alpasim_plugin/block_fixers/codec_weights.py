@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from alpasim_plugin.block_fixers.streaming import Float32Buffers
 from alpasim_plugin.core import seeding
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.checkpoints import convert, listed
+from alpasim_plugin.fixers.network.checkpoints import convert, listed
 
 WAN_MEAN = (
     -0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508,

@@ -25,7 +25,7 @@ from alpasim_plugin.block_fixers.kv_cache import BlockCache, GraphCache, Rolling
 from alpasim_plugin.block_fixers.layers import PatchEmbed, RMSNorm, TimeMap, embed_latents, sinusoid, unpatchify
 from alpasim_plugin.block_fixers.sizes import MASK_CHANNELS, DiTSizes, read_sizes
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets import checkpoints
+from alpasim_plugin.fixers.network import checkpoints
 
 RELEASED_ROPE_RATIOS = (3.0, 3.0, 1.0)  # height, width, time, as all released single-view experiments set them
 FLOAT32_KEYS = ("t_embedder.", "t_embedding_norm.", "adaln_modulation")

@@ -31,10 +31,10 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, read_bundle, weights_to_give
+from alpasim_plugin.fixers.network import checkpoints
+from alpasim_plugin.fixers.network.checkpoints import load_weights
+from alpasim_plugin.fixers.network.machine_probe import require_device
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.nets import checkpoints
-from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.machine_probe import require_device
 
 Precision = Literal["fp32", "bf16", "fp16"]
 DTYPES: Mapping[Precision, torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}

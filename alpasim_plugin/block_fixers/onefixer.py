@@ -21,13 +21,13 @@ from alpasim_plugin.block_fixers.networks import LATENT, load_networks
 from alpasim_plugin.block_fixers.pipeline import TIMED, BlockPipeline, PipelineState, StageClock, no_clock
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
+from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import DOING, Views, group_views
-from alpasim_plugin.nets.machine_probe import take_threads
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
 def latent_noise(scene_id: str, seed: int, cameras: Sequence[str], draws: int, latents: range, shape: tuple[int, int, int]) -> list[Tensor]:

@@ -27,7 +27,7 @@ from alpasim_plugin.block_fixers.sampling import finalise, mixed_source, opacity
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.streaming import State
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.schedule import from_names
+from alpasim_plugin.fixers.network.schedule import from_names
 
 STAGES = ("encode", "source", "dit", "decode", "cache write")  # of `BlockPipeline`, in order
 TIMED = ("encode", "dit", "decode", "cache write")  # what tables show: mixing noise into the source takes next to nothing

@@ -23,8 +23,8 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.dit import TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.schedule import TABLE, NoiseLevel, interpolant, shifted
 from alpasim_plugin.fixers.views import SLACK
-from alpasim_plugin.nets.schedule import TABLE, NoiseLevel, interpolant, shifted
 
 CONTEXT_STEP = 128.0
 History = Literal["finalise", "last-forward", "none"]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from alpasim_plugin.fixers.network import schedule
 from alpasim_plugin.fixers.settings import BundleKind, Part, Positive, Unit, WeightedSettings, check_steps, counted_steps
-from alpasim_plugin.nets import schedule
 
 if TYPE_CHECKING:
     pass

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.layers import PATCH
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.checkpoints import listed
+from alpasim_plugin.fixers.network.checkpoints import listed
 
 Shape = tuple[int, ...]
 AREA = PATCH * PATCH

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.interfaces import Fixer, Renderer
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
 from alpasim_plugin.fixers.loop import BlockRunner, ConditionedFrame
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.plugins.interfaces import Fixer, Renderer
 
 NEAR_M = 10.0  # beyond this distance an actor's displacement counts in proportion to its size in the image
 ARM_M = 2.5  # an actor's rotation counts as the displacement of a point this far from its centre

@@ -34,7 +34,7 @@ from alpasim_plugin.block_fixers.streaming import (
     run_layers,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.checkpoints import StateDict, unwrap
+from alpasim_plugin.fixers.network.checkpoints import StateDict, unwrap
 
 GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3

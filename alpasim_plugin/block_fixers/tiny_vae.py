@@ -52,9 +52,9 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import (
     from_grid,
     to_grid,
 )
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_safetensors
-from alpasim_plugin.nets.checkpoints import load_weights, unwrap
+from alpasim_plugin.fixers.network.checkpoints import load_weights, unwrap
 
 DOING = "loading tiny VAE weights"
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"

@@ -40,7 +40,7 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     read_layout,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.checkpoints import unwrap
+from alpasim_plugin.fixers.network.checkpoints import unwrap
 
 
 def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:

@@ -18,10 +18,10 @@ from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.block_fixers.pipeline import condition_of, map_video, opacity_input
 from alpasim_plugin.block_fixers.sampling import context_level, flow_step, mixed_source, opacity_mask, sources_needed
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import F32, I64, U8, Frame
+from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.views import group_views
-from alpasim_plugin.nets.schedule import from_names, interpolant
-from alpasim_plugin.plugins.interfaces import BlockRule
 
 
 @dataclass(frozen=True)

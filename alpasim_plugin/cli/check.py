@@ -11,9 +11,9 @@ from alpasim_plugin.cli.options import Json, Run
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.run_folder.check import Inspection, inspect_run
-from alpasim_plugin.run_folder.schema import DERIVED, MANIFEST, RUN_INFO
-from alpasim_plugin.runtime.repair import repair_run
+from alpasim_plugin.log.run_folder.check import Inspection, inspect_run
+from alpasim_plugin.log.run_folder.schema import DERIVED, MANIFEST, RUN_INFO
+from alpasim_plugin.runs.repair import repair_run
 
 DAMAGED, NOT_REPAIRED = 1, 4
 

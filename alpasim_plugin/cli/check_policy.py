@@ -15,10 +15,10 @@ from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, Finding
 from alpasim_plugin.cli.options import Json, Overrides
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.process.subprocesses import parts_print_to_stderr
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.rollout import run_rollout
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
 from evaluators.statistics.ability import ability_of, calibrate, chances

@@ -11,11 +11,11 @@ from rich.console import Console
 
 from alpasim_plugin.cli.options import Every, Json
 from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.summary import aggregate_runs, joined_metrics
+from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report import render_table

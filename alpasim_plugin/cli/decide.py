@@ -16,10 +16,10 @@ from alpasim_plugin.cli.progress import Lines, Silent, report_line
 from alpasim_plugin.cli.run import planned
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.run_folder.schema import slug
-from alpasim_plugin.runtime.decide import Decided, Design, arms_asked, execute_decision, key_of
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan
+from alpasim_plugin.core.signals import Stopped
+from alpasim_plugin.log.run_folder.schema import slug
+from alpasim_plugin.runs.decide import Decided, Design, arms_asked, execute_decision, key_of
+from alpasim_plugin.runs.plan import RunOptions, RunPlan
 from evaluators.opening import read_run
 from evaluators.report.numbers import plural
 from evaluators.report.verdict import metric_lines, verdict_line

@@ -12,10 +12,10 @@ import numpy as np
 import typer
 
 from alpasim_plugin.cli.options import Json
+from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
-from alpasim_plugin.io import places
-from alpasim_plugin.io.places import temporary_folder
-from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.core.places import temporary_folder
+from alpasim_plugin.runs.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"
 
@@ -91,7 +91,7 @@ def _video() -> str:
 
 
 def _wire() -> str:
-    from alpasim_plugin import wire
+    from alpasim_plugin.log import wire
 
     return f"compiled messages load: {wire.__name__}"
 

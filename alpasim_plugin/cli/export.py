@@ -13,15 +13,15 @@ from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.cli.view import find_cell, is_run, narrowed
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.recordings.content import DOING as RECORDING
-from alpasim_plugin.recordings.content import Recording, collect
-from alpasim_plugin.recordings.mcap_file import require_mcap, write_mcap
-from alpasim_plugin.recordings.rerun_file import require_rerun, write_rrd
-from alpasim_plugin.run_folder.schema import CONTENTS
-from alpasim_plugin.runtime.export import Export, export_run, export_scenes
-from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, read_logs
+from alpasim_plugin.log.run_folder.schema import CONTENTS
+from alpasim_plugin.runs.export import Export, export_run, export_scenes
+from alpasim_plugin.runs.recordings.content import DOING as RECORDING
+from alpasim_plugin.runs.recordings.content import Recording, collect
+from alpasim_plugin.runs.recordings.mcap_file import require_mcap, write_mcap
+from alpasim_plugin.runs.recordings.rerun_file import require_rerun, write_rrd
+from alpasim_plugin.runs.repair import use_run
 from evaluators.opening import read_so_far
+from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
 
 DOING = "exporting"
 FORMATS: dict[str, tuple[Callable[[], object], Callable[[Recording, Path], Mapping[str, int]]]] = {

@@ -14,16 +14,16 @@ from alpasim_plugin.cli.options import Json, Run
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.plugins.parts import resolve, resolve_renderer, split_names
-from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.run_folder.schema import PROBE_JSON, RUN_INFO, slug
-from alpasim_plugin.runtime.fork import Change, fork_rollout
-from alpasim_plugin.runtime.logged_rollout import find_rollout
-from alpasim_plugin.runtime.probe import probe_rollout, write_probe
-from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.why import DOING, explain
-from alpasim_plugin.viewer.cause import write_cause
+from alpasim_plugin.core.parts import resolve, resolve_renderer, split_names
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.schema import PROBE_JSON, RUN_INFO, slug
+from alpasim_plugin.runs.fork import Change, fork_rollout
+from alpasim_plugin.runs.logged_rollout import find_rollout
+from alpasim_plugin.runs.probe import probe_rollout, write_probe
+from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.runs.why import DOING, explain
 from evaluators.opening import read_run
+from evaluators.viewer.cause import write_cause
 
 FORK_EPILOG = """
 Examples:

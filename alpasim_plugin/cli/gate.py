@@ -27,15 +27,15 @@ from alpasim_plugin.cli.options import Json, Only, What, Where
 from alpasim_plugin.cli.progress import make_progress, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.plugins.parts import names
-from alpasim_plugin.run_folder.manifests import read_run_json
-from alpasim_plugin.run_folder.schema import PAGES
-from alpasim_plugin.run_folder.sides import Row
-from alpasim_plugin.runtime.decide import Design
-from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.runtime.run import Progress, execute_run
+from alpasim_plugin.core.parts import names
+from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.schema import PAGES
+from alpasim_plugin.log.run_folder.sides import Row
+from alpasim_plugin.runs.decide import Design
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.runs.reports import write_reports
+from alpasim_plugin.runs.run import Progress, execute_run
 from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files

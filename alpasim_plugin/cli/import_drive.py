@@ -21,6 +21,7 @@ from alpasim_plugin.cli.options import Json, command_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.drives.build import (
     Report,
@@ -43,7 +44,6 @@ from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import C0
-from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.world.ground import height_at
 
 DOING = "importing a trained model"

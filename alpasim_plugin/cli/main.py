@@ -23,10 +23,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.lazy import arrow_without_pandas, installed_names
-from alpasim_plugin.io import places
-from alpasim_plugin.process.signals import Stopped, leave_at_once, stoppable
+from alpasim_plugin.core.signals import Stopped, leave_at_once, stoppable
 
 if TYPE_CHECKING:
     import typer
@@ -274,7 +274,7 @@ def load_workers_early(args: Sequence[str]) -> None:
     """Let what rollouts need be loaded beside this process, if it is about to have some driven by workers of this machine."""
     is_run = bool(args) and (args[0] == "run" or args[0].startswith("-") or args[0] not in verbs())
     if is_run and not re.search(r"--(help|version|dry-run|executor|workers[= ]1\b)", " ".join(args)) and (os.cpu_count() or 1) > 1:
-        from alpasim_plugin.runtime.executors.local import load_early
+        from alpasim_plugin.runs.executors.local import load_early
 
         load_early()
 

@@ -13,12 +13,12 @@ from string import Template
 from typing import Annotated, Literal
 
 from alpasim_plugin.cli.options import Json
+from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.io.atomic import write_text
-from alpasim_plugin.plugins.parts import names, unidentified
-from alpasim_plugin.plugins.parts.resolve import declaration_of, note_of
-from alpasim_plugin.plugins.parts.source import load
+from alpasim_plugin.core.parts import names, unidentified
+from alpasim_plugin.core.parts.resolve import declaration_of, note_of
+from alpasim_plugin.core.parts.source import load
 
 LIST_PARTS_EPILOG = "Example: `simrun list scenarios`"
 

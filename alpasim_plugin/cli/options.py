@@ -14,7 +14,7 @@ import typer
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.io.limits import SEED, SEEDS
+from alpasim_plugin.core.limits import SEED, SEEDS
 
 FIXER_PREFIX = "fixer."
 
@@ -61,13 +61,13 @@ class What:
     @property
     def renderers(self) -> list[str]:
         """Give the names of the renderers."""
-        from alpasim_plugin.plugins.parts import split_names
+        from alpasim_plugin.core.parts import split_names
 
         return split_names(self.renderer)
 
     @property
     def of_fixer(self) -> tuple[str, ...]:
-        """Give the settings of fixers among the overrides, as `alpasim_plugin.runtime.plan.RunOptions` has them."""
+        """Give the settings of fixers among the overrides, as `alpasim_plugin.runs.plan.RunOptions` has them."""
         return split_overrides(self.overrides)[1]
 
     @property
@@ -93,7 +93,7 @@ class Where:
         Raises:
             InputError: There is no such executor, or it cannot be given what a worker needs.
         """
-        from alpasim_plugin.runtime.executors.choice import parse_executor
+        from alpasim_plugin.runs.executors.choice import parse_executor
 
         return {"workers": self.workers, "executor": parse_executor(self.executor), "store": self.store}
 
@@ -203,7 +203,7 @@ def _names(kind: str) -> Callable[[str], list[str]]:
     """Return what a Tab offers: names of one kind, the last of several behind commas; none with a colon, at which shells end words."""
 
     def offer(incomplete: str) -> list[str]:
-        from alpasim_plugin.plugins.parts import names
+        from alpasim_plugin.core.parts import names
         from evaluators import PRESETS
         from scenarios.suite import shipped_names, suites
 

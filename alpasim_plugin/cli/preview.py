@@ -19,18 +19,18 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from alpasim_plugin.cli.options import Json, Overrides, Overwrite, refuse_existing
+from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.geometry import interpolate, yaw_of
 from alpasim_plugin.core.types import F64, U8, Actor, Box, RenderRequest, Scenario, Trajectory
-from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.log.run_folder.schema import slug
+from alpasim_plugin.log.run_folder.writer import scene_as_json
 from alpasim_plugin.renderers.background import background_note
-from alpasim_plugin.run_folder.schema import slug
-from alpasim_plugin.run_folder.writer import scene_as_json
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.guards import checked_frames
-from alpasim_plugin.viewer.drive_data import drawn_map, recorded_drive
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.guards import checked_frames
 from evaluators.report.birdseye import chord_angle, corners
+from evaluators.viewer.drive_data import drawn_map, recorded_drive
 from scenarios.load import load_scenario
 
 Flatten = Callable[[F64], F64]  # (N, 2 or 3) metres, world -> (N, 2) metres on the page

@@ -14,8 +14,8 @@ from evaluators.metrics.outcomes import NO_OUTCOME, event_words
 from evaluators.report.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
-    from alpasim_plugin.runtime.execute import Threads
-    from alpasim_plugin.runtime.plan import RunPlan
+    from alpasim_plugin.runs.execute import Threads
+    from alpasim_plugin.runs.plan import RunPlan
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
 MAX_LINES = 1000

@@ -16,11 +16,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from alpasim_plugin.cli.options import Json, Overwrite, Quiet, fixer_overrides
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.interfaces import Fixer
+from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
-from alpasim_plugin.plugins.interfaces import Fixer
-from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_video
+from alpasim_plugin.runs.refine import RefineFiles, RefineSummary, refine_video
 
 LINE_EVERY_S = 10.0
 LARGE_CHANGE_DB = 30.0

@@ -16,14 +16,14 @@ from alpasim_plugin.cli.options import Care, Json, Quiet, RunFolder, What, Where
 from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_progress, report_line, varied_lines
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.io.limits import SOURCE_BYTES
-from alpasim_plugin.io.reading import read_bytes
-from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.run_folder.schema import OUTPUT_NAME
-from alpasim_plugin.runtime.certificate import certificate_line, foreseen
-from alpasim_plugin.runtime.execute import Threads, thread_budget
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
-from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.core.signals import Stopped
+from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
+from alpasim_plugin.runs.certificate import certificate_line, foreseen
+from alpasim_plugin.runs.execute import Threads, thread_budget
+from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators.statistics.arms import arms_of, base_named
 from scenarios.suite import expand, shipped_names
 

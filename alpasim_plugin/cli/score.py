@@ -16,20 +16,20 @@ from rich.console import Console
 
 from alpasim_plugin.cli.options import Evaluators, Json, Presets, Quiet, Report, Wait
 from alpasim_plugin.cli.progress import describe, report_line
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError, four_parts
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.plugins.parts import PartSpec, digest
-from alpasim_plugin.plugins.parts.source import own_code_digest
-from alpasim_plugin.run_folder.manifests import find_contents, read_run_json, write_manifest, write_run_json
-from alpasim_plugin.run_folder.schema import AGGREGATE, CONTENTS, slug
-from alpasim_plugin.run_folder.writer import write_parquet, write_scene, writing
-from alpasim_plugin.runtime.execute import Threads
-from alpasim_plugin.runtime.plan import SCORING
-from alpasim_plugin.runtime.provenance import hardware, versions
-from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run, origin_of
-from alpasim_plugin.runtime.score_logs import KnownScenes, LogScore, exit_code, find_logs, score_logs
-from alpasim_plugin.runtime.summary import pool_of
+from alpasim_plugin.core.parts import PartSpec, digest
+from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.log.run_folder.manifests import find_contents, read_run_json, write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.schema import AGGREGATE, CONTENTS, slug
+from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
+from alpasim_plugin.runs.execute import Threads
+from alpasim_plugin.runs.plan import SCORING
+from alpasim_plugin.runs.provenance import hardware, versions
+from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of
+from alpasim_plugin.runs.score_logs import KnownScenes, LogScore, exit_code, find_logs, score_logs
+from alpasim_plugin.runs.summary import pool_of
 from evaluators import preset as find_preset
 from evaluators import resolve_evaluators
 from evaluators.alpasim import (

@@ -15,11 +15,11 @@ from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.parts import PartSpec, build, resolve
+from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.plugins.parts import PartSpec, build, resolve
-from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.runtime.score_logs import scenario_finder
+from alpasim_plugin.runs.score_logs import scenario_finder
 
 DOING = "reading the options of simrun serve"
 MIB = 1 << 20

@@ -13,17 +13,17 @@ from alpasim_plugin.cli.options import Json, Overwrite, Run, refuse_existing
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.run_folder.manifests import read_manifest, read_run_json
-from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO, SUMMARY
-from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.viewer.cells import Wanted
-from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options, write_page
+from alpasim_plugin.core.signals import Stopped
+from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO, SUMMARY
+from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.runs.reports import write_reports
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_so_far
 from evaluators.report import render_table
+from evaluators.viewer.cells import Wanted
+from evaluators.viewer.page import DEFAULT_MB, MB, Options, write_page
 
 DOING = "watching rollouts"
 PAGE = "view.html"
@@ -85,7 +85,7 @@ def view(
 
 
 def _serve(root: Path, address: str, wanted: Wanted, options: Options, as_json: bool) -> None:
-    from alpasim_plugin.viewer.serve import RunServer, loopback  # a page needs no web server
+    from evaluators.viewer.serve import RunServer, loopback  # a page needs no web server
 
     with RunServer(loopback(address), lambda: read_so_far(root), wanted, options) as server:
         print(json.dumps({"serving": str(root), "at": server.url}) if as_json else f"watch    {server.url}   # Ctrl-C ends it", flush=True)

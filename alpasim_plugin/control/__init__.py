@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from alpasim_plugin.core.interfaces import Controller
+from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Vehicle
-from alpasim_plugin.plugins.interfaces import Controller
-from alpasim_plugin.plugins.parts import build, unidentified
 
 __all__ = ["Controller", "make_controller"]
 
@@ -13,7 +13,7 @@ def make_controller(name: str, vehicle: Vehicle) -> Controller:
     """Return a controller for a vehicle.
 
     Args:
-        name: A controller as `alpasim_plugin.plugins.parts.resolve` takes it.
+        name: A controller as `alpasim_plugin.core.parts.resolve` takes it.
         vehicle: What it moves.
 
     Raises:

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.config import load_yaml, validate
 
 MAP_DOING = "reading a CAN map"
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"

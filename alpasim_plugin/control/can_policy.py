@@ -16,8 +16,8 @@ from alpasim_plugin.control.can_bus import Address, Commands, Exchange, open_bus
 from alpasim_plugin.control.can_codec import load_map, open_codec
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import transform_points, yaw_of
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import F64, EgoState, Observation, Plan, Route, Scenario, SensorSpec, Vehicle
-from alpasim_plugin.plugins.interfaces import Policy
 
 PLAN_US, PLAN_STEP_US = 5_000_000, 100_000
 TRACK_M = 1.6  # between the wheels of an axle

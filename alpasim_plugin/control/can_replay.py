@@ -21,7 +21,7 @@ import numpy as np
 from alpasim_plugin.control.can_bus import Address, open_bus
 from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, load_map, open_codec
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.reading import check_regular, parsing
+from alpasim_plugin.core.reading import check_regular, parsing
 
 DOING = "reading a recorded drive"
 ECHOES = 128  # buses from here on repeat what the recording device sent

@@ -21,8 +21,8 @@ import numpy as np
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, se2, wrap_angle, yaw_from_quat, yaw_of
+from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
-from alpasim_plugin.plugins.interfaces import Controller
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 

@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.reading import read_bytes, read_json
 from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
@@ -31,8 +33,6 @@ from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
-from alpasim_plugin.io.reading import read_bytes, read_json
 from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
 from scenarios.recorded import RecordedLog
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, se3
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.core.reading.files import parsing
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture
-from alpasim_plugin.io.limits import SOURCE_BYTES
-from alpasim_plugin.io.reading import read_bytes
-from alpasim_plugin.io.reading.files import parsing
 
 DOING = "reading a COLMAP model"
 DO_THIS = "give a whole model: cameras, images and points3D, all .txt or all .bin"

@@ -15,13 +15,13 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, se3, trajectory_from_poses, transform_points
+from alpasim_plugin.core.reading import read_bytes, read_json_object
+from alpasim_plugin.core.reading.arrays import open_npy
+from alpasim_plugin.core.reading.files import parsing
 from alpasim_plugin.core.types import F64, Actor, Bool, Box
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture
-from alpasim_plugin.io.reading import read_bytes, read_json_object
-from alpasim_plugin.io.reading.arrays import open_npy
-from alpasim_plugin.io.reading.files import parsing
 from scenarios.recorded import split_at_gaps, stands_still
 
 DOING = "reading a DGP scene"

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import read_bytes, read_text
+from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import SourceDrive
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
-from alpasim_plugin.io.reading import read_bytes, read_text
-from alpasim_plugin.io.reading.images import check_image
 
 DOING = "reading a KITTI drive"
 PAIRS = (("image_2", "image_3"), ("image_0", "image_1"), ("image_l", "image_r"))  # the first that is there is read, left and right

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.drives.colmap import model_folder, read_colmap
 from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
@@ -16,7 +17,6 @@ from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
 from alpasim_plugin.gaussians.sh import C0
-from alpasim_plugin.io.reading import read_json_object
 
 PERIOD_US = 100_000  # between photographs without times
 PAIRS, FEWEST, CLEARLY = 6, 40, 1.5  # pairs that the axes are tried on; matches that tell; by how much one must be better

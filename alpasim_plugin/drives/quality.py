@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.core.types import F32, F64, U8
@@ -21,7 +22,6 @@ from alpasim_plugin.gaussians.fit.quality import Comparison
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.io.atomic import write_bytes, write_json, write_text
 from scenarios.drive import Obstacle
 
 ASIDE_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path

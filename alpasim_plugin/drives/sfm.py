@@ -16,15 +16,15 @@ import av
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import read_json
+from alpasim_plugin.core.reading.files import check_regular, parsing, read_bytes
+from alpasim_plugin.core.reading.images import check_image, decode_image, picture_fault
 from alpasim_plugin.core.types import F32, U8
 from alpasim_plugin.drives.colmap import model_folder, read_colmap
 from alpasim_plugin.drives.source import FEWEST, SourceDrive
-from alpasim_plugin.io.atomic import write_bytes, write_json
-from alpasim_plugin.io.limits import SOURCE_BYTES
-from alpasim_plugin.io.reading import read_json
-from alpasim_plugin.io.reading.files import check_regular, parsing, read_bytes
-from alpasim_plugin.io.reading.images import check_image, decode_image, picture_fault
 
 DOING = "finding the poses of photographs"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")

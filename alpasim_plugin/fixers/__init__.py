@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from alpasim_plugin.core.interfaces import Fixer
+from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.plugins.interfaces import Fixer
-from alpasim_plugin.plugins.parts import build, unidentified
 
 __all__ = ["fixer_settings", "make_fixer"]
 
@@ -24,7 +24,7 @@ def make_fixer(
     """Make one rollout's fixer. Networks are loaded once per process and shared.
 
     Args:
-        name: A fixer as `alpasim_plugin.plugins.parts.resolve` takes it: ``onefixer``, ``onefixer@2``, ``package.module:Class``.
+        name: A fixer as `alpasim_plugin.core.parts.resolve` takes it: ``onefixer``, ``onefixer@2``, ``package.module:Class``.
         settings: From `fixer_settings`; None for the settings that the name stands for.
         scene_id, seed: Key of the noise, with the camera and the index in the rollout.
         device: ``cpu`` or ``cuda``.

@@ -14,17 +14,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Declaration, Fixer
+from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.core.reading.files import kind_of, parse_json
 from alpasim_plugin.fixers.settings import WeightedSettings
-from alpasim_plugin.io.atomic import write_safetensors
-from alpasim_plugin.io.reading.arrays import read_metadata
-from alpasim_plugin.io.reading.files import kind_of, parse_json
-from alpasim_plugin.plugins.interfaces import Declaration, Fixer
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from alpasim_plugin.nets.checkpoints import StateDict
+    from alpasim_plugin.fixers.network.checkpoints import StateDict
 
 FORMAT = "simrun-fixer-1"
 DOING = "loading a fixer's weights"
@@ -142,7 +142,7 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in kind.must_match]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
-    from alpasim_plugin.nets.checkpoints import load_weights  # loads torch
+    from alpasim_plugin.fixers.network.checkpoints import load_weights  # loads torch
 
     parts = parts_of(load_weights(path, sha256=settings.weights.sha256.bundle))
     problems = kind.problems(parts)

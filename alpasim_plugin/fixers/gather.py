@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.kernels import njit
+from alpasim_plugin.fixers.network.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
+from alpasim_plugin.fixers.network.pixel_layers import cpu_operator
+from alpasim_plugin.fixers.network.reference_blend import CELL, CHANNELS, DETAIL, MATCH_CELLS, NOWHERE, OFFSET_PX, BesideCells, BlendHeads
 from alpasim_plugin.fixers.views import HALF
-from alpasim_plugin.nets.pixel_generator import DETAIL_IMAGES, IMAGES, GatheredCells, PixelState
-from alpasim_plugin.nets.pixel_layers import cpu_operator
-from alpasim_plugin.nets.reference_blend import CELL, CHANNELS, DETAIL, MATCH_CELLS, NOWHERE, OFFSET_PX, BesideCells, BlendHeads
-from alpasim_plugin.plugins.kernels import njit
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 

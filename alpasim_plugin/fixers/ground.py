@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
-from alpasim_plugin.plugins.kernels import njit
 
 I32 = npt.NDArray[np.int32]
 

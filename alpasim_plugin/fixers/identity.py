@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.bundle import FixerFactory
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 if TYPE_CHECKING:
     from alpasim_plugin.fixers.pixel_fixer import PixelFixer

@@ -13,16 +13,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
+from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.parts import complete
+from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.fixers.references import ReferenceSession
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, actor_boxes, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer, Renderer
-from alpasim_plugin.plugins.parts import complete
-from alpasim_plugin.plugins.parts.spec import MODES
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import PreparedMap, actor_boxes, prepare_map
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 DOING = "fixing a block of frames"

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from pydantic import Field
 
+from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.pixel_settings import FrameByFrameSettings
 from alpasim_plugin.fixers.warp import VALID
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
 class NearestSettings(FrameByFrameSettings):

@@ -16,18 +16,18 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import F32, I64, U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.guard import keep_render
+from alpasim_plugin.fixers.network.machine_probe import take_threads
+from alpasim_plugin.fixers.network.pixel_generator import GRID_PX, PixelState, content_key, pixel_noise, sparse_source
+from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.trust import trust
 from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
-from alpasim_plugin.nets.machine_probe import take_threads
-from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState, content_key, pixel_noise, sparse_source
-from alpasim_plugin.nets.schedule import from_names, interpolant
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
 @dataclass(frozen=True)

@@ -23,17 +23,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.core import kernels
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
+from alpasim_plugin.fixers.network.machine_probe import Choice, choose_precision, require_device
+from alpasim_plugin.fixers.network.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
+from alpasim_plugin.fixers.network.pixel_layers import pack
+from alpasim_plugin.fixers.network.reference_blend import CELL, DETAIL, BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.views import HALF
-from alpasim_plugin.nets.machine_probe import Choice, choose_precision, require_device
-from alpasim_plugin.nets.pixel_generator import BeforeBlend, GatheredCells, PixelGenerator, PixelSizes, PixelState, gather_cells
-from alpasim_plugin.nets.pixel_layers import pack
-from alpasim_plugin.nets.reference_blend import CELL, DETAIL, BesideCells, BlendHeads, enlarged, gather_beside, mix, sources_of
-from alpasim_plugin.plugins import kernels
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}
@@ -252,10 +252,10 @@ def draw_and_warp() -> None:
     from alpasim_plugin.core.geometry import se2
     from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
     from alpasim_plugin.fixers.ground import carry
+    from alpasim_plugin.fixers.semantic_map.draw import draw_map
+    from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
     from alpasim_plugin.fixers.trust import trust
     from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes
-    from alpasim_plugin.semantic_map.draw import draw_map
-    from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
 
     side_px = 16
     ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x

@@ -11,8 +11,8 @@ from itertools import islice
 import numpy as np
 
 from alpasim_plugin.core.image_metrics import decibels
+from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.plugins.interfaces import Fixer
 
 UNLIKE = "unlike"  # event of frames that passed through since the fixer does not know this kind of video
 

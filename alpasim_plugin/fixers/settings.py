@@ -11,10 +11,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from alpasim_plugin.core.config import apply_overrides, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.config import apply_overrides, load_yaml, validate
-from alpasim_plugin.io.yaml_positions import Document
-from alpasim_plugin.nets import schedule
+from alpasim_plugin.core.yaml_positions import Document
+from alpasim_plugin.fixers.network import schedule
 
 DOING = "reading the settings of a fixer"
 Positive = Annotated[int, Field(ge=1)]

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
-from alpasim_plugin.plugins.kernels import njit
 
 MADE_UP = 0.25  # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
 CELL_PX, MOST_COLUMNS = 16, 32  # side of a cell; a picture wider than 512 pixels has larger ones

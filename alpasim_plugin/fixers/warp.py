@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.plugins.kernels import njit
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture

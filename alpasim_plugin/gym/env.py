@@ -16,17 +16,17 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.control.bicycle import Command, step
 from alpasim_plugin.control.tracker import check_interval, planar, spatial
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Controller
+from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.plan_check import plan_problem
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.core.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec, Trajectory, Vehicle
 from alpasim_plugin.gym.reward import Instant, Reward, Scorer
-from alpasim_plugin.io.places import temporary_folder
-from alpasim_plugin.plugins.interfaces import Controller
-from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import Loop
-from alpasim_plugin.runtime.scoring import score_log
+from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import Loop
+from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import trajectory_from_poses
+from alpasim_plugin.core.parts import build
 from alpasim_plugin.core.types import F64, Actor, EgoState, MetricSeries, RolloutLog, Scenario
 from alpasim_plugin.log.schema import T_rig_box
-from alpasim_plugin.plugins.parts import build
 from evaluators import resolve_evaluators
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import check_rollout, run_evaluator

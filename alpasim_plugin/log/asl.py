@@ -17,11 +17,11 @@ from typing import Any, BinaryIO
 
 from google.protobuf.message import DecodeError
 
+from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.io.atomic import disk_error
-from alpasim_plugin.io.limits import ENTRY_BYTES, LOG_BYTES
-from alpasim_plugin.io.reading.files import open_regular
-from alpasim_plugin.wire import logging_pb2
+from alpasim_plugin.core.limits import ENTRY_BYTES, LOG_BYTES
+from alpasim_plugin.core.reading.files import open_regular
+from alpasim_plugin.log.wire import logging_pb2
 
 _LENGTH = struct.Struct(">I")
 _COPY_AGAIN = "copy the log again from where it was written; nothing after this point can be trusted"

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import images
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.io.reading import images
 
 ImageEncoding = Literal["png", "jpeg"]
 COMPRESSION = cv2.IMWRITE_PNG_COMPRESSION, 1

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import BODY_M
 from alpasim_plugin.core.types import Actor, Box, LoggedImage, LoggedPlan, RolloutLog, Trajectory
-from alpasim_plugin.io.limits import BODY_M
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO, increasing_times, read_camera, read_poses, read_trajectory, read_transform
-from alpasim_plugin.wire import common_pb2, egodriver_pb2, logging_pb2
+from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, logging_pb2
 
 
 @dataclass

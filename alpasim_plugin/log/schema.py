@@ -19,7 +19,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix, se3
 from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory, Vehicle
 from alpasim_plugin.log.images import ImageEncoding
-from alpasim_plugin.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
+from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
 SEED_BITS, DIGEST_BITS = 64, 58
 EGO = "EGO"

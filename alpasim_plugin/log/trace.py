@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.io.reading import read_json_lines
+from alpasim_plugin.core.reading import read_json_lines
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO
 

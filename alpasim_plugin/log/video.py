@@ -11,11 +11,11 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from alpasim_plugin.core.atomic import temporary_path
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.limits import ARCHIVE_BYTES
+from alpasim_plugin.core.reading import check_regular
 from alpasim_plugin.core.types import I64, U8
-from alpasim_plugin.io.atomic import temporary_path
-from alpasim_plugin.io.limits import ARCHIVE_BYTES
-from alpasim_plugin.io.reading import check_regular
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"

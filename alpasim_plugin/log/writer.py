@@ -29,7 +29,7 @@ from alpasim_plugin.log.schema import (
     wire_traffic_session,
     wire_trajectory,
 )
-from alpasim_plugin.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
 
 _SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "controller", "video_model")
 

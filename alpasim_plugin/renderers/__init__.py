@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.plugins.parts import build, unidentified
 
 
 def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "cpu", threads: int | None = None) -> Renderer:
@@ -13,7 +13,7 @@ def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "c
     Scenes are built once per process and shared between renderers.
 
     Args:
-        name: A renderer as `alpasim_plugin.plugins.parts.resolve` takes it.
+        name: A renderer as `alpasim_plugin.core.parts.resolve` takes it.
         scenario: What is rendered.
         seed: The rollout's seed: what wanders from frame to frame depends on it, the scene does not.
         device: ``cpu`` or ``cuda``.

@@ -14,8 +14,8 @@ from functools import partial
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 
 SHIFT_M = 0.5

@@ -17,6 +17,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -27,7 +28,6 @@ from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.degrade import GHOST, Surrogate, log_actors, log_times
 from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.background import read_background
 from alpasim_plugin.renderers.recorded import built_recording
 from alpasim_plugin.renderers.rolling import draw_request

@@ -18,7 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.places import MADE
 from alpasim_plugin.core.types import F32, F64, STANDING_ID, Bool, Frame, Photograph, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.lens import gain_between
@@ -28,9 +31,6 @@ from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
-from alpasim_plugin.io.cache import cached
-from alpasim_plugin.io.places import MADE
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, in_memory, scene_key, scene_of
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, read_model, recipe_of, reconstruction_key
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.checksums import sha256_of
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.checksums import sha256_of
-from alpasim_plugin.io.reading import read_json_as
-from alpasim_plugin.plugins.parts.source import own_code_digest
 
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction

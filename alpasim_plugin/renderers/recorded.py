@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Photograph, RecordedFrame, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
 DOING = "reading a recorded photograph"

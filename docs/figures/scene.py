@@ -16,8 +16,8 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, RenderRequest, Scenario
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
 from scenarios.load import load_scenario
 

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, U8, Degradation, Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.pair_sheet import HOLE_BELOW
 from alpasim_plugin.lab.training.pairs import offset_from_log
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
 from scenarios.load import load_scenario
 

@@ -33,10 +33,10 @@ from results import replace as put
 from alpasim_plugin import load_scenario, make_policy, make_renderer, run_rollout
 from alpasim_plugin.control import tracker
 from alpasim_plugin.control.bicycle import MAX_SUBSTEP_S, step
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.geometry import interpolate, trajectory_from_poses
 from alpasim_plugin.core.types import RolloutLog, Scene
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from evaluators import reduce_rollout, score

@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from trust_calibration import asked_for, words_of
 
+from alpasim_plugin.core.parts import build, resolve
+from alpasim_plugin.core.parts.resolve import split_settings
 from alpasim_plugin.core.types import F64, U8, Bool
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.warp import on_boxes, plain_points
 from alpasim_plugin.lab.bench.quality import QualityClip, fixer_input
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.plugins.parts.resolve import split_settings
 
 CLASSES = ("ground", "structures", "road users", "sky and holes")
 GROUND_M = 0.3  # a point that is higher above the plane below the rig, or lower, is not the ground

@@ -22,11 +22,11 @@ from served_frames import verdict
 
 from alpasim_plugin.alpasim.server import map_gate
 from alpasim_plugin.core.geometry import interpolate, se2
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap, Marking, Photograph, RenderRequest, Scenario
-from alpasim_plugin.plugins.interfaces import Renderer
+from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.renderers.reconstruction import ImportedRenderer
 from alpasim_plugin.renderers.recorded import posed_photograph
-from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
 from scenarios.cosmos_camera import RecordedLens, lens_of
 from scenarios.load import load_scenario
 

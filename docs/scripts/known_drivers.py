@@ -1,6 +1,6 @@
 """Record which shipped scenes known drivers pass: the scale on which `simrun check-driver` places a driver.
 
-    python docs/scripts/known_drivers.py OUT.json [--policy pure-pursuit,learned,tests/runtime/seeded_bugs.py:Latency] [SCENE...]
+    python docs/scripts/known_drivers.py OUT.json [--policy pure-pursuit,learned,tests/runs/seeded_bugs.py:Latency] [SCENE...]
 
 Scenes are driven as `simrun check-driver` drives them: behind `clean`, with AlpaSim's time line, seed 0, preset `paper`. OUT.json is
 scenarios/suites/known_drivers.json; what it has is kept, so a second call continues the first. A scene is passed without any outcome.
@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 
 from alpasim_plugin import load_scenario, make_policy, make_renderer, run_rollout
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import PolicyError
-from alpasim_plugin.io.atomic import write_json
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES
 from scenarios.suite import expand

@@ -23,7 +23,7 @@ from headline import BASELINE, DISTANCE, EVENT, FIXED, TRUE
 from results import DOCS
 from results import replace as put
 
-from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.core.atomic import write_json
 from evaluators.statistics.intervals import exact_rate
 
 LARGE, FINE = camera(512, 288), "Gaussian budget"

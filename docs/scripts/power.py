@@ -1,7 +1,7 @@
 """Drive shipped scenes with blind and broken drivers, and with those that they are made from: what tells them apart, and how soon.
 
 python -m docs.scripts.power drive --policy pure-pursuit,lane-camera OUT.json SCENE...
-python -m docs.scripts.power drive --policy bugs OUT.json SCENE...    # those of tests/runtime/seeded_bugs.py and what they are made from
+python -m docs.scripts.power drive --policy bugs OUT.json SCENE...    # those of tests/runs/seeded_bugs.py and what they are made from
 python -m docs.scripts.power table OUT.json...        # the tables of docs/experiments/power.md
 python -m docs.scripts.power rollouts OUT.json...
 """
@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin import load_scenario, make_policy, make_renderer, run_rollout
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import PolicyError
-from alpasim_plugin.io.atomic import write_json
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
 from evaluators.statistics.sequential import betting
@@ -24,7 +24,7 @@ from evaluators.statistics.sequential.draws import independent
 from evaluators.statistics.sequential.line import Plan
 from evaluators.statistics.verdicts import more_scenes
 from scenarios.suite import expand, load_suite
-from tests.runtime import seeded_bugs
+from tests.runs import seeded_bugs
 
 SUITES = ("first", "smoke", "gate_self_test", "urban", "highway", "hard")
 BLIND, NOTHING = "pure-pursuit", in_words(())

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.lab.bench.quality import QualityClip, fixer_input
 from alpasim_plugin.lab.bench.quality_run import quality_clip
 from alpasim_plugin.lab.training.pair_store import PairDataset
-from alpasim_plugin.plugins.parts import build, resolve
 
 FRAMES, WARM = 30, 21  # of a clip; before that many a network is not yet recorded and caches are cold
 

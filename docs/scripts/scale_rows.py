@@ -20,11 +20,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import scipy
 
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.manifests import write_contents, write_run_json
-from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE, SUMMARY, rollout_folder
-from alpasim_plugin.run_folder.writer import write_parquet
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.log.run_folder.columns import RolloutTable
+from alpasim_plugin.log.run_folder.manifests import write_contents, write_run_json
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE, SUMMARY, rollout_folder
+from alpasim_plugin.log.run_folder.writer import write_parquet
 from evaluators.metrics import METRICS as KNOWN
 from evaluators.statistics.summary import numbers
 

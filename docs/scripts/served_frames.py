@@ -24,14 +24,14 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.shutter import bands, bands_of, rolling
 from alpasim_plugin.core.types import F64, CameraSpec, Degradation, Exposure, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import fixer_settings, make_fixer
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, actor_boxes, prepare_map
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.wire import sensorsim_pb2
 from alpasim_plugin.renderers import rolling as drawing
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, actor_boxes, prepare_map
-from alpasim_plugin.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 
 SHUTTER_US = 30_000

@@ -15,11 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.parts import resolve_renderer, split_names
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.bench.real import Shot, request_of, shots_of
 from alpasim_plugin.lab.video_metrics.sheet import sheet
-from alpasim_plugin.plugins.parts import resolve_renderer, split_names
-from alpasim_plugin.runtime.cell import make_renderer
+from alpasim_plugin.runs.cell import make_renderer
 from scenarios.load import load_scenario
 
 WIDTH = 512

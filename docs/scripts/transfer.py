@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.lab.bench.paper import arms_in
@@ -24,7 +25,6 @@ from alpasim_plugin.lab.training.pair_store import Pair
 from alpasim_plugin.lab.training.transfer_pairs import pair_frames
 from alpasim_plugin.lab.training.transfer_scenes import HEIGHT, WIDTH, TransferScene, transfer_scene
 from alpasim_plugin.lab.video_metrics.sheet import sheet
-from alpasim_plugin.plugins.parts import build, resolve
 
 TIMES = (0, 24, 49, 74, 99)
 FIRST, SETTLED, LAST = 40, 45, 69  # frames of the arms: a history of five, then those that are measured

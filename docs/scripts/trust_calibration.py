@@ -13,6 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from alpasim_plugin.core.parts import build, resolve
+from alpasim_plugin.core.parts.resolve import split_names
 from alpasim_plugin.core.types import F64, TRUST_CELLS
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -20,8 +22,6 @@ from alpasim_plugin.fixers.trust import CELL_PX, LEVELS, MOST_COLUMNS, trust_cel
 from alpasim_plugin.lab.bench.quality import QualityClip, fixer_input
 from alpasim_plugin.lab.bench.quality_run import quality_clip
 from alpasim_plugin.lab.training.pair_store import PairDataset
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.plugins.parts.resolve import split_names
 from evaluators.statistics.intervals import t_interval
 
 GUESSED, RECORDED = (0, 1 / 16, 1 / 8, 1 / 4, 1), (0, 1 / 8, 1 / 2, 7 / 8, 1)  # borders of the classes

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from alpasim_plugin.io.config import load_yaml, validate
+from alpasim_plugin.core.config import load_yaml, validate
 from evaluators.metrics.presets import ALPASIM, Preset
 
 DOING = "reading evaluation settings"

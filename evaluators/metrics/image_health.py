@@ -23,7 +23,7 @@ def decode(image: LoggedImage) -> U8:
     Raises:
         InputError: The bytes are no image, or one larger than the bounds.
     """
-    from alpasim_plugin.io.reading.images import decode_image
+    from alpasim_plugin.core.reading.images import decode_image
 
     where = f"camera {image.camera!r} at {image.end_us} us"
     return np.asarray(decode_image(image.data, where, "decoding a logged image", "log PNG or JPEG"), dtype=np.uint8)

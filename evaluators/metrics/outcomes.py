@@ -22,7 +22,7 @@ from evaluators.metrics.score import handover_us, series, with_preset
 from evaluators.metrics.table import METRICS
 
 if TYPE_CHECKING:
-    from alpasim_plugin.run_folder.rows import Rollout
+    from alpasim_plugin.log.run_folder.rows import Rollout
 
 
 @dataclass(frozen=True)

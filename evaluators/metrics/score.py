@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import EvaluatorError, SimrunError
+from alpasim_plugin.core.interfaces import Evaluator
+from alpasim_plugin.core.parts import PartSpec, build, names, resolve
+from alpasim_plugin.core.parts.spec import BUILTIN
 from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
-from alpasim_plugin.plugins.interfaces import Evaluator
-from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
-from alpasim_plugin.plugins.parts.spec import BUILTIN
 from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.table import METRICS, MetricTable, table_of

@@ -19,7 +19,7 @@ from alpasim_plugin.core.types import MetricInfo as MetricInfo
 from evaluators.scores.table import BENCHMARKS
 
 if TYPE_CHECKING:
-    from alpasim_plugin.plugins.parts.spec import PartSpec
+    from alpasim_plugin.core.parts.spec import PartSpec
 
 MIN_ADE = "min_ade@{}s({})"  # seconds as Python writes a float: 0.5, 1.0, 0.25
 _MIN_ADE_NAME = re.compile(r"min_ade@(\d+\.\d+)s\((gt|self)\)")

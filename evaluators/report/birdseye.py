@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.run_folder.rows import Rollout, Series
+from alpasim_plugin.log.run_folder.rows import Rollout, Series
 from evaluators.report.numbers import fixed
 from evaluators.report.rollouts import Event, clock_zero_us, events_of
 

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.run_folder.shapes import pair_tables
+from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
 from evaluators.report.numbers import LEAST_SPAN, finite, interval

@@ -8,13 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.escape import xml as clean
-from alpasim_plugin.io.atomic import write_text
-from alpasim_plugin.run_folder.reader import reporting
-from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.sides import Row
+from alpasim_plugin.log.run_folder.reader import reporting
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.sides import Row
 from evaluators.metrics.outcomes import in_words, outcomes_of, told
 from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run, read_run

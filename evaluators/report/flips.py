@@ -11,12 +11,12 @@ from typing import Any
 import cv2
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.limits import SOURCE_BYTES
-from alpasim_plugin.io.reading import read_bytes
-from alpasim_plugin.io.reading.images import decode_image
-from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import cell_name
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.core.reading.images import decode_image
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.numbers import Cell, fixed, missing, short

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from alpasim_plugin.run_folder.shapes import pair_tables
+from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.opening import Run
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short

@@ -21,14 +21,14 @@ from jinja2 import __version__ as jinja_version
 from jinja2.bccache import Bucket
 from markupsafe import Markup
 
+from alpasim_plugin.core.atomic import write_bytes, write_text
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.io.atomic import write_bytes, write_text
-from alpasim_plugin.io.limits import SOURCE_BYTES
-from alpasim_plugin.io.reading import parsing, read_bytes
-from alpasim_plugin.io.reading.images import decode_image
-from alpasim_plugin.run_folder.reader import reporting
-from alpasim_plugin.run_folder.rows import Rollout, Series
-from alpasim_plugin.run_folder.schema import AGAIN, DOING, STRIP_NAME, WHY_NAME
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import parsing, read_bytes
+from alpasim_plugin.core.reading.images import decode_image
+from alpasim_plugin.log.run_folder.reader import reporting
+from alpasim_plugin.log.run_folder.rows import Rollout, Series
+from alpasim_plugin.log.run_folder.schema import AGAIN, DOING, STRIP_NAME, WHY_NAME
 from evaluators.metrics.outcomes import OUTCOMES, first_failure, has_ended, in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables

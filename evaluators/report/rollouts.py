@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.types import F64, U8
-from alpasim_plugin.run_folder.rows import Own, Rollout, Series, series_by_cell
-from alpasim_plugin.run_folder.schema import WHY_NAME
+from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
+from alpasim_plugin.log.run_folder.schema import WHY_NAME
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, has_ended, in_words, outcomes_of, told
 from evaluators.opening import Run
 from evaluators.report.charts import Chart, Curve, line_chart

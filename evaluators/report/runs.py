@@ -12,12 +12,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from alpasim_plugin.core.checksums import read_sealed
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.checksums import read_sealed
-from alpasim_plugin.io.lock import holder_of
-from alpasim_plugin.io.reading.files import as_shape, read_json_as
-from alpasim_plugin.run_folder.schema import CONTENTS, LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
-from alpasim_plugin.run_folder.shapes import RunInfo, Summary
+from alpasim_plugin.core.lock import holder_of
+from alpasim_plugin.core.reading.files import as_shape, read_json_as
+from alpasim_plugin.log.run_folder.schema import CONTENTS, LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
+from alpasim_plugin.log.run_folder.shapes import RunInfo, Summary
 from evaluators.metrics import MetricTable
 
 DOING = "listing runs"
@@ -61,7 +61,7 @@ class RunEntry:
 
     @property
     def project(self) -> Mapping[str, Any]:
-        """Give what `alpasim_plugin.runtime.provenance.Project` names; empty for a run of an earlier version."""
+        """Give what `alpasim_plugin.runs.provenance.Project` names; empty for a run of an earlier version."""
         return self.info.get("project") or {}
 
     @property

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
+from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.metrics import METRICS
 from evaluators.opening import Run
 from evaluators.report.charts import GRID, MARKERS, N_COLOURS, VARIANT, Axes, Chart

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import WHY_NAME
-from alpasim_plugin.run_folder.shapes import pair_tables
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import WHY_NAME
+from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run

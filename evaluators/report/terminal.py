@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from alpasim_plugin.core.escape import terminal as escape
-from alpasim_plugin.run_folder.rows import Rollout
-from alpasim_plugin.run_folder.schema import cell_name
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.presets import contact_note

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, columns_of
-from alpasim_plugin.run_folder.sides import RendererRows, Row
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, columns_of
+from alpasim_plugin.log.run_folder.sides import RendererRows, Row
 from evaluators.report.runs import CHECK, RunEntry, as_time
 from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import difference

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.core.atomic import write_text
 from evaluators.report.charts import MARKERS, N_COLOURS, VARIANT, Axes, Chart
 from evaluators.report.html import render_page
 from evaluators.report.numbers import finite, interval

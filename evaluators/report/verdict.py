@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.checksums import checksums_of
-from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.run_folder.schema import ROLLOUTS, WHY_NAME
-from alpasim_plugin.run_folder.sides import Row, value_of
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.checksums import checksums_of
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
+from alpasim_plugin.log.run_folder.sides import Row, value_of
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.opening import Run
 from evaluators.report.numbers import decimals, fixed, short

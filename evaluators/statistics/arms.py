@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder.columns import RendererColumns
-from alpasim_plugin.run_folder.schema import cell_name
-from alpasim_plugin.run_folder.sides import RendererRows, Side
+from alpasim_plugin.log.run_folder.columns import RendererColumns
+from alpasim_plugin.log.run_folder.schema import cell_name
+from alpasim_plugin.log.run_folder.sides import RendererRows, Side
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import read_json_object
-from alpasim_plugin.io.reading.files import as_shape, kind_of
-from alpasim_plugin.plugins.parts import digest
-from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.schema import ROLLOUTS
-from alpasim_plugin.run_folder.sides import Row, is_ok
+from alpasim_plugin.core.parts import digest
+from alpasim_plugin.core.reading import read_json_object
+from alpasim_plugin.core.reading.files import as_shape, kind_of
+from alpasim_plugin.log.run_folder.columns import RolloutTable
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS
+from alpasim_plugin.log.run_folder.sides import Row, is_ok
 from evaluators.opening import Run, read_run
 
 

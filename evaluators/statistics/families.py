@@ -15,7 +15,7 @@ import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.run_folder.sides import Side
+from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.statistics.intervals import cluster_means, within
 from evaluators.statistics.paired import Pairs, difference_bounds
 

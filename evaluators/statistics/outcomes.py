@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import CONTACT_SIDES, OUTCOMES, has_ended, outcomes_of, reached_end, told
 
 Times = Mapping[tuple[str, str, str, int], Mapping[str, float]]  # cell -> outcome -> seconds after the first frame

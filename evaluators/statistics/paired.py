@@ -13,7 +13,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Bool
-from alpasim_plugin.run_folder.sides import Cell, Row, Side, by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import Cell, Row, Side, by_renderer, metric_names
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.bounded import mean_bounds
 from evaluators.statistics.intervals import (

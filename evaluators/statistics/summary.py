@@ -11,9 +11,9 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.schema import cell_name
-from alpasim_plugin.run_folder.sides import RendererRows, Row, Side, by_renderer, failure_of, metric_names, reason_of
+from alpasim_plugin.log.run_folder.columns import RolloutTable
+from alpasim_plugin.log.run_folder.schema import cell_name
+from alpasim_plugin.log.run_folder.sides import RendererRows, Row, Side, by_renderer, failure_of, metric_names, reason_of
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.arms import Arm, axis_bases
 from evaluators.statistics.families import by_family

@@ -1,4 +1,4 @@
-"""Compile the ``.proto`` files of `alpasim_plugin.wire.protos`. Generated modules are checked in: no installation needs a compiler.
+"""Compile the ``.proto`` files of `alpasim_plugin.log.wire.protos`. Generated modules are checked in: no installation needs a compiler.
 
 The generator is the oldest that writes code for Python 3.11; what it writes loads under protobuf 4.25 up to 6. It cannot be installed
 beside a newer protobuf, so it gets an environment of its own::

@@ -11,7 +11,7 @@ import torch
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from tests.alpasim.service_cases import StandInRenderer, hosted
 
 

@@ -22,8 +22,8 @@ from alpasim_plugin.alpasim.client.served_drives import pinhole as pinhole
 from alpasim_plugin.alpasim.client.served_drives import request as request
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
-from alpasim_plugin.wire import sensorsim_pb2
-from alpasim_plugin.wire.services import OPTIONS, Stub
+from alpasim_plugin.log.wire import sensorsim_pb2
+from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
 __all__ = ["StandInRenderer"]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log.asl import AslFile, AslReader
-from alpasim_plugin.wire import logging_pb2
+from alpasim_plugin.log.wire import logging_pb2
 from tests.examples import examples
 
 

@@ -19,7 +19,7 @@ from alpasim_plugin.alpasim.bridge import build as building
 from alpasim_plugin.alpasim.bridge import client as check
 from alpasim_plugin.alpasim.bridge.client import RendererClient
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import CAMERA, StandInRenderer, drive, hosted
 from tests.alpasim.test_wire_generated import environment
 

@@ -20,15 +20,15 @@ from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InfrastructureError, InputError, PolicyError, RendererError
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.runtime.score_logs import scenario_finder
-from alpasim_plugin.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
-from alpasim_plugin.wire.services import Stub, handlers
+from alpasim_plugin.log.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire.services import Stub, handlers
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
+from alpasim_plugin.runs.score_logs import scenario_finder
 from scenarios.load import load_scenario
 from scenarios.suite import shipped_names
 

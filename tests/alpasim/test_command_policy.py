@@ -19,13 +19,13 @@ import pytest
 from alpasim_plugin.alpasim.client.command import Command
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import split_policies
+from alpasim_plugin.core import subprocesses as children
 from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.parts import build, resolve
+from alpasim_plugin.core.subprocesses import MOST_BYTES, Child, end_children, exit_reason, parts_print_to_stderr, say
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.process import subprocesses as children
-from alpasim_plugin.process.subprocesses import MOST_BYTES, Child, end_children, exit_reason, parts_print_to_stderr, say
 from policies.conformance import STRAIGHT, canned_scenario, observations
 
 pytestmark = pytest.mark.slow
@@ -187,7 +187,7 @@ def test_a_port_is_asked_for_by_its_place_holder(folder: Path) -> None:
 def test_a_command_ends_with_the_process_that_started_it_however_that_ends(tmp_path: Path, number: int) -> None:
     starting = """
 import sys, time
-from alpasim_plugin.process.subprocesses import Child
+from alpasim_plugin.core.subprocesses import Child
 code = "import os, time; print(os.getpid()); time.sleep(60)"
 Child([sys.executable, "-S", "-c", code], {}, lambda line: print(line, flush=True), lambda: None)
 time.sleep(60)

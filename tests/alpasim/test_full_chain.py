@@ -16,16 +16,16 @@ import yaml
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import DriverService
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.runtime.score_logs import scenario_finder
-from alpasim_plugin.wire import SERVICE_PATHS
-from alpasim_plugin.wire.services import OPTIONS, handlers, methods
+from alpasim_plugin.log.wire import SERVICE_PATHS
+from alpasim_plugin.log.wire.services import OPTIONS, handlers, methods
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
+from alpasim_plugin.runs.score_logs import scenario_finder
 from evaluators import reduce_rollout, score
 from evaluators.metrics.presets import preset
 from scenarios.load import load_scenario

@@ -23,11 +23,11 @@ from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.alpasim.server.status import CallTime, Late
 from alpasim_plugin.alpasim.server.views import read_lens, read_view, straight_of
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
-from alpasim_plugin.wire.services import Stub, methods
+from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
+from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import START_US, StandInRenderer, channel_to, hosted, pinhole, request
 from tests.alpasim.test_server_lenses import ftheta
 

@@ -9,8 +9,8 @@ from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.sensorsim import LIDARS, points_of
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.log.schema import wire_pose
-from alpasim_plugin.wire import sensorsim_pb2
-from alpasim_plugin.wire.services import Stub
+from alpasim_plugin.log.wire import sensorsim_pb2
+from alpasim_plugin.log.wire.services import Stub
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import channel_to, hosted
 

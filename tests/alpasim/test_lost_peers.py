@@ -19,7 +19,7 @@ import pytest
 from alpasim_plugin.alpasim.client.channel import Service
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, RendererError, SimrunError
-from alpasim_plugin.wire import egodriver_pb2
+from alpasim_plugin.log.wire import egodriver_pb2
 from tests.alpasim.service_cases import hosted
 
 REPO = Path(__file__).resolve().parents[2]

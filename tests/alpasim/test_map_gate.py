@@ -26,12 +26,12 @@ from alpasim_plugin.alpasim.server.sources import MAP_OFF
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.core.geometry import interpolate, se2
 from alpasim_plugin.core.types import F64, U8, Box, CameraSpec, LaneMap, Marking
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
+from alpasim_plugin.fixers.semantic_map.style import OPENGL
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
-from alpasim_plugin.semantic_map.style import OPENGL
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
 

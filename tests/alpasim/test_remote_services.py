@@ -13,12 +13,12 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.control.tracker import PlanTracker
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.geometry import interpolate, se2, trajectory_from_poses
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import EgoState, RolloutLog, Scenario, Trajectory
 from alpasim_plugin.log.schema import read_trajectory, read_transform, wire_dynamics, wire_pose
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.wire import common_pb2, controller_pb2, physics_pb2, traffic_pb2
+from alpasim_plugin.log.wire import common_pb2, controller_pb2, physics_pb2, traffic_pb2
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import hosted
 

@@ -19,9 +19,9 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
+from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire.services import Stub
 from alpasim_plugin.renderers.gaussian import CleanRenderer
-from alpasim_plugin.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
-from alpasim_plugin.wire.services import Stub
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import answers, channel_to, hosted, in_front_of, pinhole
 

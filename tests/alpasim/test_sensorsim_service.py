@@ -15,8 +15,8 @@ from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.wire import common_pb2, sensorsim_pb2
-from alpasim_plugin.wire.services import Stub
+from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire.services import Stub
 from tests.alpasim.service_cases import (
     CAMERA,
     HEIGHT,

@@ -16,8 +16,8 @@ import typer.main
 
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.cli.main import make_app, verbs
-from alpasim_plugin.wire import common_pb2
-from alpasim_plugin.wire.services import Stub, methods
+from alpasim_plugin.log.wire import common_pb2
+from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import answers, drive
 
 

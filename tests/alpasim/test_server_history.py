@@ -12,7 +12,7 @@ from alpasim_plugin.alpasim.server.history import HistoryTree, apart, on_line
 from alpasim_plugin.alpasim.server.views import View, read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import START_US, STEP_US, drive, request
 
 Tree = HistoryTree[tuple[bytes, ...]]

@@ -11,7 +11,7 @@ import pytest
 from alpasim_plugin.alpasim.server.views import Lens, read_lens, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import pinhole
 
 Spec = sensorsim_pb2.CameraSpec

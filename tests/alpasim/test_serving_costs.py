@@ -14,7 +14,7 @@ from alpasim_plugin.alpasim.server.frames import Announced, cost_s
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import View, read_view
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.test_sensorsim_local import SCENE, ask
 
 VIEW = replace(read_view(ask()), width=1920, height=1080)

@@ -22,8 +22,8 @@ from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.wire import common_pb2, health_pb2, reflection_pb2, sensorsim_pb2
-from alpasim_plugin.wire.services import Stub, methods
+from alpasim_plugin.log.wire import common_pb2, health_pb2, reflection_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import StandInRenderer, answers, channel_to, drive, hosted, in_front_of
 
 EMPTY = common_pb2.Empty()

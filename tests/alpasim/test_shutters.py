@@ -17,11 +17,11 @@ from alpasim_plugin.alpasim.server.views import read_lens, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
 from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import U8, Exposure, RenderRequest
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import actor_boxes
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
 from tests.alpasim.test_server_lenses import distorted, fisheye, ftheta

@@ -8,7 +8,7 @@ from pathlib import Path
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from alpasim_plugin import wire
+from alpasim_plugin.log import wire
 from alpasim_plugin.log.asl import AslReader
 
 GRPC = ("health_pb2", "reflection_pb2")  # gRPC's own services

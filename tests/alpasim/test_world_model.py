@@ -17,8 +17,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.log.images import decode_image, encode_image
 from alpasim_plugin.log.schema import wire_box, wire_pose
-from alpasim_plugin.wire import common_pb2, sensorsim_pb2, video_model_pb2
-from alpasim_plugin.wire.services import Stub
+from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2, video_model_pb2
+from alpasim_plugin.log.wire.services import Stub
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import channel_to, hosted
 

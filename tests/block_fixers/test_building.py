@@ -10,7 +10,7 @@ import pytest
 PROGRAM = """
 import sys
 import torch
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyDecoder, TinyVAE, WanVAE
+from alpasim_plugin.fixers.network import CosmosCausalDiT, DiTSizes, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.block_fixers.sizes import initial_weights
 from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 TinyVAE.from_state_dict(TinyVAE.random().state_dict())

@@ -10,7 +10,7 @@ from alpasim_plugin.block_fixers.attention import rotate
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.layers import embed_latents, patchify, sinusoid
 from alpasim_plugin.block_fixers.sampling import context_level, sample_block
-from alpasim_plugin.nets.schedule import from_names
+from alpasim_plugin.fixers.network.schedule import from_names
 from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import furthest, stream
 

@@ -15,8 +15,8 @@ from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers.bundle import read_bundle, save_bundle
-from alpasim_plugin.io.reading.arrays import read_metadata
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 

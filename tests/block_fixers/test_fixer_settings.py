@@ -13,10 +13,10 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import FixerError, InputError
+from alpasim_plugin.core.interfaces import BlockRule
+from alpasim_plugin.core.parts import names
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.settings import FixerSettings, WeightsSettings, load_settings
-from alpasim_plugin.plugins.interfaces import BlockRule
-from alpasim_plugin.plugins.parts import names
 from tests.block_fixers.fixer_cases import small_settings
 
 

@@ -13,7 +13,7 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.nets.schedule import steps
+from alpasim_plugin.fixers.network.schedule import steps
 from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_reference import random_weights
 from tests.block_fixers.eager_recorder import EagerRecorder

@@ -12,9 +12,9 @@ import torch
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.plugins.interfaces import Fixer
 from tests.block_fixers.fixer_cases import busy_settings, fixer, record_videos, run_blocks, small_settings
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
 

@@ -15,7 +15,7 @@ from alpasim_plugin.block_fixers.sampling import (
     sources_needed,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.schedule import from_names, interpolant, named, shifted, steps
+from alpasim_plugin.fixers.network.schedule import from_names, interpolant, named, shifted, steps
 from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import clip, furthest, network
 

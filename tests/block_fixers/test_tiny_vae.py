@@ -13,7 +13,7 @@ from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import COMPONENTS, CosineTransform, TinySizes, from_grid, to_grid
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from tests.block_fixers.codec_cases import clip, noise
 
 SIZES = TinySizes(encoder_quarter=8, encoder_eighth=12, decoder_eighth=16, decoder_quarter=10, decoder_frame=6)

@@ -81,7 +81,7 @@ def test_a_policy_that_cannot_be_made_is_a_finding_and_one_that_is_not_there_an_
 
 
 SHORT = ["--workers", "1", "--certify", "none", "--no-report", "--set", "timing.duration_us=600000", "smoke/straight"]
-GREY = ["--renderer", "tests.runtime.grey_renderer:Grey"]
+GREY = ["--renderer", "tests.runs.grey_renderer:Grey"]
 
 
 def test_a_run_with_a_policy_that_prints_gives_one_document(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ import yaml
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslReader
-from alpasim_plugin.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json
 from evaluators.alpasim import load_settings
 
 FRONT = "camera_front_wide_120fov"

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from alpasim_plugin.runtime.run import execute_run
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
-from tests.runtime.test_fork import CELL, SHORT
-from tests.runtime.test_runs import Announced
+from tests.runs.test_fork import CELL, SHORT
+from tests.runs.test_runs import Announced
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from tests.io.checksum_files import vouch_for
+from tests.core.checksum_files import vouch_for
 from tests.report.make_run import Plan, make_run
 
 SCENES = tuple(f"scene-{i:02d}" for i in range(8))

@@ -67,7 +67,7 @@ def test_pandas_is_loaded_for_other_peoples_code_alone() -> None:
     code = (
         "import sys; from alpasim_plugin.cli.main import make_app; make_app('report')\n"
         "import pyarrow; table = pyarrow.table({'a': ['b']}); print('pandas' in sys.modules)\n"
-        "from alpasim_plugin.plugins.parts.source import load; load('json:loads', 'policy')\n"
+        "from alpasim_plugin.core.parts.source import load; load('json:loads', 'policy')\n"
         "print(table.to_pandas().a[0], 'pandas' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == ["False", "b", "True"]

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
-from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runs.rollout import run_rollout
 from scenarios.load import load_scenario
 
 pytest.importorskip("cantools", reason="cantools is not installed: pip install 'alpasim-onefixer[can]'")

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import simrun
-from alpasim_plugin.plugins.parts.source import reached
+from alpasim_plugin.core.parts.source import reached
 
 
 def test_every_public_name_is_there_and_has_one_home(repo: Path) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from alpasim_plugin.run_folder.check import inspect_run
-from alpasim_plugin.run_folder.manifests import inspect_rollout
+from alpasim_plugin.log.run_folder.check import inspect_run
+from alpasim_plugin.log.run_folder.manifests import inspect_rollout
 
 # Members of summary.json that say how long something took, or how it was run.
 OF_THE_MACHINE = ("speed", "pool", "determinism")

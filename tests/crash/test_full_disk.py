@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.run_folder.check import inspect_run
-from tests.runtime.test_run_folders import plan_of, run
-from tests.runtime.test_runs import comparable
+from alpasim_plugin.log.run_folder.check import inspect_run
+from tests.runs.test_run_folders import plan_of, run
+from tests.runs.test_runs import comparable
 
 
 class Disk:

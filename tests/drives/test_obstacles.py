@@ -97,7 +97,7 @@ def test_contact_with_what_stands_is_reported_apart_and_is_unknown_where_it_was_
 
 
 def test_what_stands_in_the_model_is_not_drawn_once_more() -> None:
-    from alpasim_plugin.runtime.loop_state import drawn
+    from alpasim_plugin.runs.loop_state import drawn
 
     poses = {"obstacle-001-within-0.1m": np.eye(4), "car-7": np.eye(4)}
     assert list(drawn(poses)) == ["car-7"]

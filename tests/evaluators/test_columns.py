@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder import columns
-from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.sides import RendererRows, by_renderer, metric_names
+from alpasim_plugin.log.run_folder import columns
+from alpasim_plugin.log.run_folder.columns import RolloutTable
+from alpasim_plugin.log.run_folder.sides import RendererRows, by_renderer, metric_names
 from evaluators import aggregate, paired
 from evaluators.statistics.gate import GateSpec, judge, judge_table
 from evaluators.statistics.paired import base_pairs

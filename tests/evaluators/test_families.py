@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from scipy import stats
 
-from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.log.run_folder.columns import RolloutTable
 from evaluators.statistics.families import family_bounds, grouped
 from evaluators.statistics.summary import numbers
 

@@ -9,7 +9,7 @@ import pytest
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES, evaluate_outcomes, in_words, outcomes_of, recorded_speed
 from evaluators.metrics.presets import PRESETS

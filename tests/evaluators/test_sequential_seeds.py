@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from alpasim_plugin.run_folder.sides import by_renderer
+from alpasim_plugin.log.run_folder.sides import by_renderer
 from evaluators.statistics.sequential.differences import (
     SceneDifferences,
     best_seeds,

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder.sides import by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import by_renderer, metric_names
 from evaluators import aggregate, censoring, paired
 from evaluators.statistics.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
 from evaluators.statistics.paired import base_pairs

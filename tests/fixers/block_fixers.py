@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.plugins.interfaces import BlockRule
 
 
 class Blend:

@@ -40,10 +40,10 @@ fixer = make_fixer("onefixer", scene_id="scene", seed=0)
 assert fixer.trained and not fixed.events and (fixed.rgb != rgb).any()
 """
 ABSENT = """
-import alpasim_plugin.nets
-alpasim_plugin.nets.installed = lambda group: {}
+import alpasim_plugin.fixers.network
+alpasim_plugin.fixers.network.installed = lambda group: {}
 try:
-    from alpasim_plugin.nets import WanVAE
+    from alpasim_plugin.fixers.network import WanVAE
 except ImportError as error:
     assert "WanVAE" in str(error) and "simrun.networks" in str(error), error
 else:
@@ -64,7 +64,7 @@ def test_without_the_rooms_core_modules_import_onefixer_repairs_and_an_absent_ne
 
 @pytest.mark.parametrize("name", ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"])
 def test_networks_of_the_block_generators_are_imported_by_their_public_names(name: str) -> None:
-    from alpasim_plugin import nets
+    from alpasim_plugin.fixers import network as nets
 
     assert getattr(nets, name).__module__.startswith(ROOMS[0])
     with pytest.raises(AttributeError, match="no attribute"):

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
+from alpasim_plugin.fixers.network.pixel_generator import PixelState, gather_cells
+from alpasim_plugin.fixers.network.reference_blend import BlendHeads, gather_beside, likeness, mix, offsets, sources_of
 from alpasim_plugin.fixers.pixel_network import in_floats, smaller
-from alpasim_plugin.nets.pixel_generator import PixelState, gather_cells
-from alpasim_plugin.nets.reference_blend import BlendHeads, gather_beside, likeness, mix, offsets, sources_of
 
 
 def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Tensor, Tensor, PixelState]:

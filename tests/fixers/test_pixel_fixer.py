@@ -13,14 +13,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle, save_bundle
 from alpasim_plugin.fixers.guard import keep_render, render_share
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
-from alpasim_plugin.plugins.interfaces import BlockRule
 from tests.block_fixers.fixer_cases import small_settings
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
 

@@ -8,7 +8,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS
 from alpasim_plugin.fixers.trust import CELL_PX, LEVELS, MADE_UP, MOST_COLUMNS, trust, trust_cells
-from alpasim_plugin.viewer.pictures import seen_before, trust_by_time
+from evaluators.viewer.pictures import seen_before, trust_by_time
 
 
 @pytest.mark.parametrize(("height", "width"), [(144, 256), (150, 250), (9, 7), (288, 512), (270, 600)])

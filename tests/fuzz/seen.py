@@ -20,7 +20,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from tests.io.checksum_files import vouch_for
+from tests.core.checksum_files import vouch_for
 from tests.report.make_run import Plan, make_run
 from tests.scenarios import make_argoverse, make_commonroad, make_usdz
 

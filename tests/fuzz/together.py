@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS_TABLE, STEPS_TABLE, VALID, Column, columns_of, metrics_in
+from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, STEPS_TABLE, VALID, Column, columns_of, metrics_in
 
 Files = dict[str, bytes]
 Tables = dict[str, pa.Table]

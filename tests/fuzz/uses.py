@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.io.checksum_files import vouch_for
+from tests.core.checksum_files import vouch_for
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Refused(Exception):
 
 def drive(path: Path, *overrides: str) -> None:
     """Load a scenario and drive three steps of it."""
-    from alpasim_plugin.plugins.interfaces import Renderer
-    from alpasim_plugin.runtime.rollout import run_rollout
+    from alpasim_plugin.core.interfaces import Renderer
+    from alpasim_plugin.runs.rollout import run_rollout
     from policies import make_policy
     from scenarios.load import load_scenario
 
@@ -95,7 +95,7 @@ def use_gaussians(path: Path) -> None:
 def use_log(path: Path) -> None:
     from alpasim_plugin.log import read_asl, read_facts
     from alpasim_plugin.log.trace import trace_log
-    from alpasim_plugin.runtime.scoring import contacts_of
+    from alpasim_plugin.runs.scoring import contacts_of
     from evaluators import PRESETS, reduce_rollout, score
     from scenarios.load import load_scenario
 
@@ -109,14 +109,14 @@ def use_log(path: Path) -> None:
 
 def use_bundle(path: Path) -> None:
     from alpasim_plugin.fixers.bundle import bundle_fixer
-    from alpasim_plugin.nets.checkpoints import load_weights
+    from alpasim_plugin.fixers.network.checkpoints import load_weights
 
     bundle_fixer(path)
     load_weights(path)
 
 
 def use_weights(path: Path) -> None:
-    from alpasim_plugin.nets.checkpoints import load_weights
+    from alpasim_plugin.fixers.network.checkpoints import load_weights
 
     load_weights(path)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from alpasim_plugin.io.config import load_yaml
+from alpasim_plugin.core.config import load_yaml
+from tests.core.checksum_files import vouch_for
 from tests.fuzz.seen import compressed_ply, xodr
-from tests.io.checksum_files import vouch_for
 
 REPO = Path(__file__).resolve().parents[2]
 

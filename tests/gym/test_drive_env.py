@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Observation, Plan
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.run_folder.schema import LOG_NAME
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.log.run_folder.schema import LOG_NAME
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
 from evaluators import score
 from policies import make_policy
 

@@ -6,10 +6,10 @@ import random
 
 import pytest
 
+from tests.core.reading.test_reading import SLICE
 from tests.examples import first_of
 from tests.fuzz.targets import check, inputs, workplace
 from tests.fuzz.uses import Target
-from tests.io.reading.test_reading import SLICE
 from tests.lab.fuzz_targets import TARGETS
 
 

@@ -9,6 +9,7 @@ import pytest
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from tests.log.make_rollout import write_rollout
+from tests.report.conftest import usual_run as usual_run
 
 
 @pytest.fixture

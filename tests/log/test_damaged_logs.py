@@ -13,7 +13,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
-from alpasim_plugin.wire import logging_pb2
+from alpasim_plugin.log.wire import logging_pb2
 from tests.log.make_rollout import T0_US
 
 

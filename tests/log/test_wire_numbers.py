@@ -16,7 +16,7 @@ from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw, se2, s
 from alpasim_plugin.core.types import Actor, Box, Trajectory
 from alpasim_plugin.log import AslWriter
 from alpasim_plugin.log.schema import read_poses, wire_pose, wire_poses, wire_trajectory
-from alpasim_plugin.wire import common_pb2
+from alpasim_plugin.log.wire import common_pb2
 from tests.examples import examples
 from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 CODE = """
 import sys
 sys.modules["av"] = None
-import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runtime.refine
+import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runs.refine
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.log.video import VideoReader
 try:

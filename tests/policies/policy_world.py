@@ -9,8 +9,8 @@ import numpy as np
 
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.geometry import inverse, quat_from_yaw, trajectory_from_poses, transform_points, yaw_of
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import F64, U8, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory, Vehicle
-from alpasim_plugin.plugins.interfaces import Policy
 from policies.conformance import canned_scenario
 from policies.painted_road import PaintedRoad, pinhole_camera
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2, yaw_of
+from alpasim_plugin.core.parts import names
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
-from alpasim_plugin.plugins.parts import names
 from policies import check_policy
 from policies.conformance import canned_scenario
 from policies.simple import PurePursuit

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.parts import names as known
 from alpasim_plugin.core.types import RenderRequest, Scenario
-from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.plugins.parts import names as known
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.broken import LATE_US, SHIFT_M
 from alpasim_plugin.renderers.gaussian import clear_cache

@@ -9,10 +9,10 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import BackgroundFile, Behaviour, Degradation, Frame, RenderRequest, Scenario, Trajectory
 from alpasim_plugin.gaussians import write_ply
 from alpasim_plugin.gaussians.scene.degrade import GHOST
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import SurrogateRenderer, clear_cache, scene_key, scene_of
 from tests.gaussians.scene_maps import parked, straight

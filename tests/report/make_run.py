@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
-from alpasim_plugin.run_folder.sides import by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import by_renderer, metric_names
 from evaluators.opening import read_run
 from evaluators.report.flips import find_flips
 from evaluators.statistics.paired import base_pairs, paired

@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.opening import Run, read_run
 from evaluators.report.birdseye import path_data, scene_view
 from evaluators.report.rollouts import events_of, read_series

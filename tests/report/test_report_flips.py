@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import write_report

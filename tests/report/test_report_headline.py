@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run, read_run
 from evaluators.report.headline import find, tone_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.run_folder.writer import scene_as_json
+from alpasim_plugin.log.run_folder.writer import scene_as_json
 from evaluators.report.birdseye import road_users
 from scenarios.load import load_scenario
 

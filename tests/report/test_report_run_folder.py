@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder.rows import series_by_cell
+from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import read_run
 
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics import METRICS
 from evaluators.opening import Run, read_run
 from evaluators.report import write_report

@@ -146,7 +146,7 @@ def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> No
 
 
 def test_renderer_without_frames_has_no_speed() -> None:
-    from alpasim_plugin.run_folder.reader import Run
+    from alpasim_plugin.log.run_folder.reader import Run
 
     nothing = dict.fromkeys(("ms_per_frame_p50", "ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms"))
     speeds = {"a": nothing | {"stages": {}}}

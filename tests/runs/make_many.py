@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.run_folder.manifests import write_contents, write_run_json
-from alpasim_plugin.run_folder.schema import ROLLOUTS_TABLE
-from alpasim_plugin.run_folder.writer import write_table
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.log.run_folder.manifests import write_contents, write_run_json
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE
+from alpasim_plugin.log.run_folder.writer import write_table
 from evaluators import aggregate
 
 COMMITS = ("3f2a9c1d" * 5, "8b07ee42" * 5, "c51d9a60" * 5)

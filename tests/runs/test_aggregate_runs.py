@@ -12,8 +12,8 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder.manifests import write_contents
-from alpasim_plugin.runtime.summary import aggregate_runs
+from alpasim_plugin.log.run_folder.manifests import write_contents
+from alpasim_plugin.runs.summary import aggregate_runs
 from tests.runs.make_many import SCENES, Many, make_one
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.processes import this_process
-from alpasim_plugin.io.lock import one_writer
 from tests.runs.make_many import COMMITS, Many, make_one, unfinish
 
 OLD, MIDDLE, NEW = "2026-01-10T08:00:00+00:00", "2026-02-10T08:00:00+00:00", "2026-03-10T08:00:00+00:00"

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.run_folder.manifests import read_manifest, read_run_json, write_contents, write_run_json
+from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json, write_contents, write_run_json
 from evaluators import resolve_evaluators
 from evaluators.metrics import table_of
 from evaluators.opening import read_run

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from alpasim_plugin.run_folder.rows import series_by_cell
+from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import Run, read_run
 from tests.report.make_run import Plan, make_run
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.config import load_yaml
 from scenarios.suite import load_suite
 
 DEPTH = 12

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import ego_state_from_log, interpolate
+from alpasim_plugin.core.parts import names
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.plugins.parts import names
 from alpasim_plugin.world.actors import make_actors
 from scenarios.load import load_scenario
 from scenarios.sources import detect

@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, Trajectory, Vehicle
 from alpasim_plugin.log import AslWriter, RolloutHeader, write_facts
-from alpasim_plugin.run_folder.manifests import write_manifest, write_run_json
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.opening import read_run
 from tests.report.make_run import DT_US, Plan, make_run
 

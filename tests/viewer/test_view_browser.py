@@ -10,11 +10,11 @@ from urllib.parse import quote
 
 import pytest
 
-from alpasim_plugin.viewer.cells import Wanted
-from alpasim_plugin.viewer.page import Options, write_page
-from alpasim_plugin.viewer.serve import RunServer
 from evaluators.opening import read_run, read_so_far
 from evaluators.report import write_report
+from evaluators.viewer.cells import Wanted
+from evaluators.viewer.page import Options, write_page
+from evaluators.viewer.serve import RunServer
 from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings

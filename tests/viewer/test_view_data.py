@@ -19,12 +19,12 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.log import read_asl, read_facts, write_facts, write_mp4
-from alpasim_plugin.run_folder.rows import series_by_cell
-from alpasim_plugin.viewer.cells import Wanted, cell_data, cells_of, check_wanted, index_data, read_logs, shown_by_default
-from alpasim_plugin.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
-from alpasim_plugin.viewer.pictures import Fineness
+from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import read_run
 from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
+from evaluators.viewer.cells import Wanted, cell_data, cells_of, check_wanted, index_data, read_logs, shown_by_default
+from evaluators.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
+from evaluators.viewer.pictures import Fineness
 from tests.report.make_run import DT_US, Plan
 from tests.viewer.make_watched import BARS, WATCHED, make_watched, picture
 

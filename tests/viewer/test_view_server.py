@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.run_folder.reader import RunSoFar
-from alpasim_plugin.viewer import serve
-from alpasim_plugin.viewer.cells import Wanted
-from alpasim_plugin.viewer.page import Options
-from alpasim_plugin.viewer.serve import RunServer, file_below, loopback
+from alpasim_plugin.log.run_folder.reader import RunSoFar
 from evaluators.opening import read_so_far
+from evaluators.viewer import serve
+from evaluators.viewer.cells import Wanted
+from evaluators.viewer.page import Options
+from evaluators.viewer.serve import RunServer, file_below, loopback
 from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched, unfinished
 

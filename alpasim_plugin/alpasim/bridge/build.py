@@ -14,7 +14,7 @@ from pathlib import Path
 from alpasim_plugin import __version__
 
 HERE = Path(__file__).resolve().parent
-WIRE = HERE.parents[1] / "wire"
+WIRE = HERE.parents[1] / "log" / "wire"
 PACKAGE = "alpasim_onefixer_bridge"
 SUFFIXES = (".py", ".pyi", ".proto", ".yaml", ".json")
 INIT = '"""What AlpaSim needs of OneFixer in its own environment: wire messages, presets, a client."""\n'
@@ -51,7 +51,7 @@ def stage(target: Path) -> None:
         for path in sorted(source.rglob("*")):
             if path.suffix in SUFFIXES and path.name != "compile.py":
                 copy(path, package / name / path.relative_to(source))
-    client = (HERE / "client.py").read_text().replace("from ...wire", "from .wire")  # there the messages lie two folders nearer
+    client = (HERE / "client.py").read_text().replace("from ...log.wire", "from .wire")  # there the messages lie two folders nearer
     (package / "client.py").write_text(client)
     (package / "__init__.py").write_text(INIT)
     (target / "pyproject.toml").write_text(PROJECT)

@@ -13,8 +13,8 @@ from typing import Any
 
 import grpc
 
-from ...wire import common_pb2, sensorsim_pb2
-from ...wire.services import OPTIONS, Stub
+from ...log.wire import common_pb2, sensorsim_pb2
+from ...log.wire.services import OPTIONS, Stub
 
 PAUSES_S = (0.5, 2.0)  # before the second and the third attempt
 BACKEND = "Stopped waiting for backend"

@@ -12,8 +12,8 @@ import grpc
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log.images import ImageEncoding
-from alpasim_plugin.wire import common_pb2
-from alpasim_plugin.wire.services import OPTIONS, Stub, is_lost_connection
+from alpasim_plugin.log.wire import common_pb2
+from alpasim_plugin.log.wire.services import OPTIONS, Stub, is_lost_connection
 
 READY_S = 30.0  # how long a service may take to accept its first call
 CALL_S = 300.0  # AlpaSim's own deadline of a render
@@ -66,7 +66,7 @@ class Service:
     """One service behind an address.
 
     Args:
-        name: Name of the service, as in `alpasim_plugin.wire.SERVICE_PATHS`.
+        name: Name of the service, as in `alpasim_plugin.log.wire.SERVICE_PATHS`.
         target: ``HOST:PORT``.
         error: Class of the errors that a failing call raises; a lost connection is no policy's fault: `InfrastructureError`.
         retries: Whether a call that may pass is made again, as AlpaSim does with renders and not with drivers.

@@ -23,8 +23,8 @@ from urllib.parse import parse_qs
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
+from alpasim_plugin.core.subprocesses import Child, exit_reason, say
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.process.subprocesses import Child, exit_reason, say
 
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"

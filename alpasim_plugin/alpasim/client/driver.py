@@ -20,11 +20,11 @@ import numpy as np
 from alpasim_plugin.alpasim.client.channel import Address, Service, encoding_of
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, inverse, se3, wrap_angle, yaw_of
+from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.schema import read_trajectory, wire_camera, wire_dynamics, wire_image, wire_trajectory
-from alpasim_plugin.plugins.interfaces import Policy
-from alpasim_plugin.wire import FRONT_WIDE, common_pb2, egodriver_pb2
+from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, egodriver_pb2
 
 OPTIONS = ("cameras", "encoding", "timeout_s")
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up

@@ -18,7 +18,7 @@ import numpy as np
 
 from alpasim_plugin.alpasim.client.channel import Service
 from alpasim_plugin.core.errors import SimrunError
-from alpasim_plugin.wire import egodriver_pb2
+from alpasim_plugin.log.wire import egodriver_pb2
 
 LIMIT_S = 0.1  # of a drive call, in the public challenge
 HORIZON_US, MINADE_US = 2_000_000, 5_000_000  # what AlpaSim's controller needs, and its evaluation

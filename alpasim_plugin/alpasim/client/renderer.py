@@ -11,11 +11,11 @@ from typing import Any
 from alpasim_plugin.alpasim.client.channel import READY_S, Address, Service, encoding_of
 from alpasim_plugin.alpasim.client.driver import cameras_of
 from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_render_request
-from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
 OPTIONS = ("scene", "cameras", "encoding")
 DOING = "asking a renderer service"

@@ -10,7 +10,7 @@ import numpy as np
 from alpasim_plugin.core.geometry import quat_from_matrix, se2
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.wire import api_version, common_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import api_version, common_pb2, sensorsim_pb2
 
 CAMERA = "camera_front_wide_120fov"
 WIDTH, HEIGHT = 48, 32

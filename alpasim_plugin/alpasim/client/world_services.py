@@ -24,6 +24,7 @@ from alpasim_plugin.alpasim.client.channel import Address, Service
 from alpasim_plugin.control.tracker import check_interval, check_plan, coast_to_stop
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, trajectory_from_poses
+from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.types import F64, EgoState, Scenario, Trajectory, Vehicle
 from alpasim_plugin.log.schema import (
     EGO,
@@ -36,8 +37,7 @@ from alpasim_plugin.log.schema import (
     wire_traffic_session,
     wire_trajectory,
 )
-from alpasim_plugin.plugins.interfaces import Controller
-from alpasim_plugin.wire import common_pb2, controller_pb2, physics_pb2, traffic_pb2
+from alpasim_plugin.log.wire import common_pb2, controller_pb2, physics_pb2, traffic_pb2
 from alpasim_plugin.world.actors import Actors
 
 OPTIONS = ("physics", "scene", "timeout_s")

@@ -22,10 +22,10 @@ from alpasim_plugin.alpasim.server.shutters import Shutter
 from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource, read_masks
 from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.plugins.parts import RendererSpec
-from alpasim_plugin.plugins.parts.spec import digest, file_digest
-from alpasim_plugin.wire import api_version, common_pb2
-from alpasim_plugin.wire.services import OPTIONS, Stub
+from alpasim_plugin.core.parts import RendererSpec
+from alpasim_plugin.core.parts.spec import digest, file_digest
+from alpasim_plugin.log.wire import api_version, common_pb2
+from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
 DOING = "setting up a renderer service"
 RECONNECT = (("grpc.min_reconnect_backoff_ms", 200), ("grpc.initial_reconnect_backoff_ms", 200), ("grpc.max_reconnect_backoff_ms", 2000))

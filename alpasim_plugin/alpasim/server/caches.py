@@ -14,17 +14,17 @@ from typing import Any, Protocol
 
 from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Renderer
+from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.references import ReferenceSession
+from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.log.schema import wire_camera
-from alpasim_plugin.plugins.interfaces import BlockRule, Renderer
-from alpasim_plugin.plugins.parts import RendererSpec, build, complete, resolve_renderer
-from alpasim_plugin.runtime.guards import checked_frames
-from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
-from alpasim_plugin.wire import FRONT_WIDE, sensorsim_pb2
+from alpasim_plugin.log.wire import FRONT_WIDE, sensorsim_pb2
+from alpasim_plugin.runs.guards import checked_frames
 from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
 

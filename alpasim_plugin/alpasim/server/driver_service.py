@@ -29,12 +29,12 @@ from alpasim_plugin.alpasim.server.status import answering
 from alpasim_plugin.alpasim.server.views import MAX_TIME_US, Straight, straight_of
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
+from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import increasing_times, read_poses, read_transform, wire_trajectory
-from alpasim_plugin.plugins.interfaces import Policy, complete
-from alpasim_plugin.wire import api_version, common_pb2, egodriver_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import api_version, common_pb2, egodriver_pb2, sensorsim_pb2
 
 DOING = "driving for AlpaSim"
 ADDRESS = "SIMRUN_POLICY_ADDRESS"

@@ -22,7 +22,7 @@ from alpasim_plugin.alpasim.server.views import MAX_PIXELS, View, read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.images import ImageEncoding, encode_image
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 
 DOING = "answering a render request"
 ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}

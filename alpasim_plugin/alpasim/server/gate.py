@@ -18,8 +18,8 @@ import grpc
 from google.protobuf.message import DecodeError
 
 from alpasim_plugin.alpasim.server.status import CallTime, Late
-from alpasim_plugin.wire import SERVICE_PATHS, health_pb2
-from alpasim_plugin.wire.services import V1ALPHA
+from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
+from alpasim_plugin.log.wire.services import V1ALPHA
 
 OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
 LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)

@@ -21,7 +21,7 @@ from alpasim_plugin.alpasim.server.gate import Gate, Health
 from alpasim_plugin.alpasim.server.status import Full
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.wire.services import OPTIONS, Reflection, handlers
+from alpasim_plugin.log.wire.services import OPTIONS, Reflection, handlers
 
 DOING = "opening a port"
 CALLS = 512  # threads for calls that are worked on, or wait for that

@@ -21,8 +21,8 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import project
 from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
 
 WIDTH_PX = 480  # pictures are compared at this width
 PAINT_SHARE = 0.035  # of the width: what is broader is no paint

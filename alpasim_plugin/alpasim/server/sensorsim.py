@@ -17,7 +17,7 @@ from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.log.schema import wire_trajectory
-from alpasim_plugin.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
 DOING = "serving AlpaSim's renderer service"
 SCAN_PX = 900, 604  # of a picture of a quarter of the horizon: 0.13 degrees a pixel in its middle

@@ -18,7 +18,7 @@ from scipy import ndimage
 from alpasim_plugin.alpasim.server.views import Lens, View, read_lens, sought
 from alpasim_plugin.core.shutter import Along, rolling
 from alpasim_plugin.core.types import F32, F64, Exposure
-from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.log.wire import sensorsim_pb2
 
 Shutter = Literal["asked", "rolling", "global"]
 ROLLS: Mapping[int, tuple[Along, bool]] = {

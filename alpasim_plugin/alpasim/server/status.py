@@ -18,7 +18,7 @@ from typing import Any
 import grpc
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
-from alpasim_plugin.wire.services import is_lost_connection
+from alpasim_plugin.log.wire.services import is_lost_connection
 
 Code = grpc.StatusCode
 BACKEND = "Stopped waiting for backend"

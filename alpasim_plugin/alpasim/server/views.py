@@ -20,7 +20,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame
-from alpasim_plugin.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
 DOING = "reading a render request"
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it

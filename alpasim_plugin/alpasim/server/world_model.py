@@ -27,13 +27,13 @@ from alpasim_plugin.alpasim.server.status import CallTime, Failures, UnknownScen
 from alpasim_plugin.alpasim.server.views import Lens, read_lens, read_pose
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
-from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.images import check_image
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
-from alpasim_plugin.wire import common_pb2, video_model_pb2
+from alpasim_plugin.log.wire import common_pb2, video_model_pb2
 
 DOING = "serving AlpaSim's video-model service"
 FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

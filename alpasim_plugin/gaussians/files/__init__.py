@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading.files import open_regular, parsing
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianArrays, GaussianCloud, build_cloud
 from alpasim_plugin.gaussians.files.packed import is_compressed_ply, read_compressed_ply, read_splat, read_spz
 from alpasim_plugin.gaussians.files.ply import read_ply_arrays, read_ply_header
 from alpasim_plugin.gaussians.files.sog import is_sog, read_sog
-from alpasim_plugin.io.reading.files import open_regular, parsing
 
 DOING = "reading a Gaussian model"
 SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz", ".sog (also as a folder with meta.json)")

@@ -16,14 +16,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import GAUSSIANS
+from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.core.reading.files import unzstd
 from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud
 from alpasim_plugin.gaussians.files.ply import PlyHeader, read_ply_element, read_ply_header
 from alpasim_plugin.gaussians.sh import C0
-from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.io.limits import GAUSSIANS
-from alpasim_plugin.io.reading import read_bytes
-from alpasim_plugin.io.reading.files import unzstd
 
 CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

@@ -16,11 +16,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from alpasim_plugin.core.atomic import atomic_file, write_bytes
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import GAUSSIANS
+from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud, build_cloud, logit, sigmoid
-from alpasim_plugin.io.atomic import atomic_file, write_bytes
-from alpasim_plugin.io.limits import GAUSSIANS
-from alpasim_plugin.io.reading.files import open_regular
 
 _REQUIRED = (
     "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",

@@ -17,11 +17,11 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import GAUSSIANS, PICTURE_PIXELS, SOURCE_BYTES
+from alpasim_plugin.core.reading import parse_json, read_bytes
+from alpasim_plugin.core.reading.files import as_shape, parsing
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
-from alpasim_plugin.io.limits import GAUSSIANS, PICTURE_PIXELS, SOURCE_BYTES
-from alpasim_plugin.io.reading import parse_json, read_bytes
-from alpasim_plugin.io.reading.files import as_shape, parsing
 
 DOING = "reading a SOG model"
 META = "meta.json"

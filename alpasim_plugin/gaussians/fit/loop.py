@@ -13,8 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -37,9 +40,6 @@ from alpasim_plugin.gaussians.fit.views import PosedView, halved
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
-from alpasim_plugin.io.atomic import write_safetensors
-from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.arrays import START_ANEW, read_checkpoint
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
 DEPTH_CLIP = 0.5  # of a share: a measured depth may be wrong altogether

@@ -25,8 +25,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import read_bytes, read_json_object
+from alpasim_plugin.core.reading.files import as_shape
+from alpasim_plugin.core.reading.images import check_image, decode_image, picture_fault
 from alpasim_plugin.core.types import F64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -34,11 +39,6 @@ from alpasim_plugin.gaussians.files.ply import read_ply_element, read_ply_header
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.limits import SOURCE_BYTES
-from alpasim_plugin.io.reading import read_bytes, read_json_object
-from alpasim_plugin.io.reading.files import as_shape
-from alpasim_plugin.io.reading.images import check_image, decode_image, picture_fault
 
 FILE = "transforms.json"
 DOING = "reading photographs"

@@ -16,7 +16,10 @@ import cv2
 import numpy as np
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import read_json_as
+from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.types import F32, F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
@@ -24,9 +27,6 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.builder import with_background
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import read_json_as
-from alpasim_plugin.io.reading.images import read_image
 
 DOING = "reading a reconstruction"
 INDEX_FILE, BACKGROUND_FILE, SKY_FILE = "reconstruction.json", "background.ply", "sky.png"

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import HALF_WIDTH, RADIUS_X, RADIUS_Y, RECORD, SLOPE, TILE, TOP_Y, U, V, Z
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.plugins.kernels import njit
 
 _RADIX_BITS = 11
 _LOW = np.int64(0xFFFFFFFF)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, PEAK, RECORD, TILE, B, G, R, Z
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.raster.raster_kernels import (
@@ -40,7 +41,6 @@ from alpasim_plugin.gaussians.raster.raster_kernels import (
     whitened,
 )
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3, sh_terms
-from alpasim_plugin.plugins.kernels import njit
 
 _f = np.float32
 _sh_terms = njit(cache=True, nogil=True, error_model="numpy")(sh_terms)

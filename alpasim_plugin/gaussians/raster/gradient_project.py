@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     CAM_FX,
@@ -54,7 +55,6 @@ from alpasim_plugin.gaussians.raster.gradient_kernels import (
     basis_gradient,
     write_basis,
 )
-from alpasim_plugin.plugins.kernels import njit
 
 _f = np.float32
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     BLOCK_REACH,
@@ -62,7 +63,6 @@ from alpasim_plugin.gaussians.constants import (
 )
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
-from alpasim_plugin.plugins.kernels import njit
 
 _f = np.float32
 _EPS = _f(EPS2D_PX2)

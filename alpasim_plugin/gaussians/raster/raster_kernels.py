@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -38,7 +39,6 @@ from alpasim_plugin.gaussians.constants import (
     Z,
 )
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.plugins.kernels import njit
 
 _f = np.float32
 _nodes = np.cos(np.pi * (np.arange(6) + 0.5) / 6) / 2  # interpolation at Chebyshev nodes of [-0.5, 0.5]

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
@@ -41,7 +42,6 @@ from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import bundles_in_view, project_parts
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
-from alpasim_plugin.io.places import require_kernels
 
 
 class Buffers(threading.local):

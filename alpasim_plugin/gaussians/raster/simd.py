@@ -22,7 +22,7 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-from alpasim_plugin.plugins.kernels import njit
+from alpasim_plugin.core.kernels import njit
 
 LANES = 16
 _I32 = ir.IntType(32)

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.plugins.kernels import njit
 
 TOLERANCE, MARGIN_M = 0.06, 0.3  # a point this share of depth, plus this, behind the surface that was seen still counts as seen
 EDGE_SHARE = 0.05  # a Gaussian just outside the image still shows in it

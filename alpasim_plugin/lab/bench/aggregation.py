@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 
 import alpasim_plugin.lab.video_metrics.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
 from alpasim_plugin.core.processes import resident_mb
-from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
-from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.log.run_folder.columns import RolloutTable
 from evaluators.metrics import METRICS
 from evaluators.statistics.summary import aggregate, aggregate_sides
 

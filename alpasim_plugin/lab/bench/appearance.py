@@ -21,10 +21,11 @@ import numpy as np
 import torch
 
 from alpasim_plugin.block_fixers.settings import STYLES
+from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import U8, CameraSpec
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.lab.bench.judged import Judging, camera_of
 from alpasim_plugin.lab.bench.quality import RAW, QualityClip, Variant, row_key, run_variant
 from alpasim_plugin.lab.bench.quality_run import encoded, identity, quality_clip, shown_frames
@@ -41,9 +42,8 @@ from alpasim_plugin.lab.training.seen_scene import restyle_video, scene_of, seen
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.lab.video_metrics.sheet import sheet
-from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.runtime.executors.local import map_jobs
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.runs.executors.local import map_jobs
 
 FRAMES = 198  # of a clip at most, as in the paper
 JUDGE_SEEDS = (0, 1)

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.core.atomic import disk_error, temporary_path, write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.io.atomic import disk_error, temporary_path, write_bytes, write_json
-from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.lab.bench.quality import Variant
 from alpasim_plugin.lab.bench.quality_run import QualityRun, evenly, row_of
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE
@@ -24,7 +25,6 @@ from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.training.snapshots import SNAPSHOTS
 from alpasim_plugin.lab.training.trainer import LOG_FILE, STATE_FILE
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME as PERCEPTUAL
-from alpasim_plugin.plugins.parts import resolve
 
 DOING = "choosing a learning rate"
 SPLIT = "val"

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.io.reading import parsing, read_json_object
 from alpasim_plugin.lab.bench.quality import Variant
 from alpasim_plugin.lab.bench.quality_run import evenly
 from alpasim_plugin.lab.paper.claims import DISTILLED, OURS
@@ -17,7 +18,6 @@ from alpasim_plugin.lab.training.arms.run import arms_of
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.training.snapshots import core_seconds, snapshots_of
-from alpasim_plugin.plugins.parts import resolve
 
 DOING = "measuring quality against training time"
 SPLIT = "val"

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.checksums import sha256_of
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.lab.bench.trained_arms import STEPS
 from alpasim_plugin.lab.paper.closed_loop import BASELINE, METRICS, Driven
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE
-from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.opening import Run, read_run
 
 DOING = "reading drives behind the arms"

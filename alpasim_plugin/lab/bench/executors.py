@@ -18,11 +18,11 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.runtime.commits import RolloutResult, unpack
-from alpasim_plugin.runtime.executors.assignment import Contents, assignment_as_here
-from alpasim_plugin.runtime.executors.base import Backend, Lost, Node, Resources
-from alpasim_plugin.runtime.executors.choice import Executor, kept_open, opened_backend
-from alpasim_plugin.runtime.executors.pool import run_jobs
+from alpasim_plugin.runs.commits import RolloutResult, unpack
+from alpasim_plugin.runs.executors.assignment import Contents, assignment_as_here
+from alpasim_plugin.runs.executors.base import Backend, Lost, Node, Resources
+from alpasim_plugin.runs.executors.choice import Executor, kept_open, opened_backend
+from alpasim_plugin.runs.executors.pool import run_jobs
 
 DOING = "measuring an executor"
 LOG = "rollout.asl"

@@ -31,7 +31,7 @@ from alpasim_plugin.lab.bench import pixel_fixer
 from alpasim_plugin.lab.bench.fixer_drive import drive
 from alpasim_plugin.lab.bench.fixer_rows import DRIVEN, SCENE, Bench, BenchOptions, Case, Row, difference, in_own_process, p50_p95
 from alpasim_plugin.lab.bench.fixer_speed import Timing, measure
-from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runs.provenance import hardware, versions
 
 SLOW_FRAMES = 21  # of a slow row's clip: three blocks
 NO_WEIGHTS = tuple(f"weights.{part}=null" for part in ("bundle", "dit", "vae", "decoder", "prompt"))

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.block_fixers.whole_clip import Clip
+from alpasim_plugin.core.interfaces import Fixer, Renderer
 from alpasim_plugin.core.types import U8, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.plugins.interfaces import Fixer, Renderer
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
 from policies import make_policy
 from scenarios.load import load_scenario
 

@@ -11,10 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.core.errors import FixerError
+from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers.refine import Difference
 from alpasim_plugin.lab.bench.fixer_speed import Timing
-from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 
 Weights = Literal["stand-in", "identity", "random"]
 SCENE = "bench-fixer"  # key of the noise

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 
 from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.io.places import temporary_folder
 from alpasim_plugin.lab.bench.fixer_drive import RecordingRenderer
 from alpasim_plugin.renderers.gaussian import clear_cache
-from alpasim_plugin.runtime.cell import make_renderer
-from alpasim_plugin.runtime.provenance import hardware, versions
-from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.provenance import hardware, versions
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
 from policies import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import expand

@@ -13,9 +13,9 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, I64, U8, CameraSpec, Scenario
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, actor_boxes, prepare_map
 from alpasim_plugin.gaussians.scene.degrade import log_actors
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import ActorBox, actor_boxes, prepare_map
 
 LANES_M = (-0.5, -0.25, 0.0, 0.25, 0.5)
 BOXES_M = (-0.25, 0.0, 0.25)

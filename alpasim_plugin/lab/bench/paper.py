@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.lab.bench.appearance import JUDGE_SEEDS, AppearanceRun, measure_appearance
 from alpasim_plugin.lab.bench.cost import cost_clips, cost_curves
 from alpasim_plugin.lab.bench.drives import read_drives
@@ -41,8 +42,7 @@ from alpasim_plugin.lab.paper.wrong_map import Shift
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
-from alpasim_plugin.plugins.parts import resolve
-from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runs.provenance import hardware, versions
 
 DOING = "making the paper's comparison"
 OURS = "V9"  # the paper's own method on the backbone that the arms share

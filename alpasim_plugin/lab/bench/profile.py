@@ -25,9 +25,9 @@ from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_s
 from alpasim_plugin.lab.bench.aggregation import write_random_table
 from alpasim_plugin.lab.bench.evaluators import PAPER
 from alpasim_plugin.lab.bench.raster import SKY
-from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.runtime.cell import run_cell
-from alpasim_plugin.runtime.plan import RunOptions, make_plan
+from alpasim_plugin.log.run_folder.columns import RolloutTable
+from alpasim_plugin.runs.cell import run_cell
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from evaluators.metrics.reference import busy_road
 from evaluators.metrics.score import score
 from evaluators.statistics.summary import numbers

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Fixer
+from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -21,8 +23,6 @@ from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.facts import JOD
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
-from alpasim_plugin.plugins.interfaces import Fixer
-from alpasim_plugin.plugins.parts import PartSpec
 
 RAW = "3dgs"  # the variant of the unfixed render
 VERSION = 3  # of what a row holds and how it is measured; part of its key

@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import build
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.io.atomic import atomic_file, write_bytes, write_json
-from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.bench.colour_video_vdp import DISPLAY, ColourVideoVDP, load_metric
 from alpasim_plugin.lab.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row
 from alpasim_plugin.lab.bench.map_error import shifted_maps
@@ -38,11 +40,9 @@ from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, shipped_weight
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
-from alpasim_plugin.nets.checkpoints import file_sha256
-from alpasim_plugin.plugins.parts import build
-from alpasim_plugin.run_folder.reader import read_json
-from alpasim_plugin.runtime.executors.local import map_jobs
-from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.runs.executors.local import map_jobs
+from alpasim_plugin.runs.provenance import hardware, versions
 
 DOING = "measuring quality"
 Given = Literal["render", "truth", "lost-resolution"]  # what the fixers get

@@ -16,6 +16,7 @@ import scipy
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, U8, CameraSpec, Photograph, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.degrade import log_actors
@@ -23,7 +24,6 @@ from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance, picture_distances
 from alpasim_plugin.lab.video_metrics.warp import warp_l1
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.recorded import posed_photograph
 
 DOING = "measuring renderers against photographs"

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.fixers.network.pixel_generator import HOLE, PixelGenerator
 from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench.quality import RAW, Variant
@@ -21,7 +22,6 @@ from alpasim_plugin.lab.paper.regime import HISTORIES, OWN, RegimeClip, under
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.reference_store import open_references
 from alpasim_plugin.lab.video_metrics.frames import psnr_db
-from alpasim_plugin.nets.pixel_generator import HOLE, PixelGenerator
 
 DOING = "measuring what a history is worth"
 

@@ -21,8 +21,8 @@ import numpy as np
 from alpasim_plugin.alpasim.client.served_drives import PaintedRenderer, drive
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.wire import sensorsim_pb2
-from alpasim_plugin.wire.services import OPTIONS, Stub
+from alpasim_plugin.log.wire import sensorsim_pb2
+from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
 PARTS_AT = 4  # frames that all rollouts share
 EPISODE = 200  # frames of a rollout in the soak, as AlpaSim's default

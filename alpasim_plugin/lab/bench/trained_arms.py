@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from alpasim_plugin.io.reading import parsing, read_json_object
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.lab.paper.training import WITHIN, TrainedArm
 from alpasim_plugin.lab.training.arms.run import PLAN_FILE, arms_of, minutes_of
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE

@@ -14,8 +14,8 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.processes import resident_mb
+from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
-from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 
 KIB_OF_MIB, MB_OF_MIB = 1024.0, 2**20 / 1e6
 

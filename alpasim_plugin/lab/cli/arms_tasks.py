@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import parsing, read_json_object
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.lab.bench.arm_choice import Choice, Score, choose, take, write_card
 from alpasim_plugin.lab.training.arms.plan import INITIAL, Plan, Training, comparison, training_names
 from alpasim_plugin.lab.training.arms.run import ArmsRun, train
-from alpasim_plugin.runtime.executors.local import Send
+from alpasim_plugin.runs.executors.local import Send
 
 SWEEP = "sweep"
 DOING = "training the arms"

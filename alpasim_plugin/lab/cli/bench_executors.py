@@ -12,7 +12,7 @@ import typer
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.executors import RESULT_BYTES, ExecutorRow, bench_executor, local_nodes
 from alpasim_plugin.lab.cli.bench_rows import print_rows
-from alpasim_plugin.runtime.executors.choice import parse_executor
+from alpasim_plugin.runs.executors.choice import parse_executor
 
 DOING = "measuring an executor"
 

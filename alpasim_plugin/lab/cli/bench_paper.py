@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.atomic import write_json, write_text
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_json, write_text
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.bench.paper import DOING, PaperRun, compare_arms
 from alpasim_plugin.lab.bench.quality_run import Work
@@ -24,7 +24,7 @@ from alpasim_plugin.lab.paper.published import published
 from alpasim_plugin.lab.paper.record import record_of, recorded
 from alpasim_plugin.lab.training.model_card import command as command_line
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
-from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runs.provenance import hardware, versions
 
 BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer", "appearance")
 PROTOCOLS = (*BY_DEFAULT, "cost", "regime")

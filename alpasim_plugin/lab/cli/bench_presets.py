@@ -10,7 +10,7 @@ import typer
 
 from alpasim_plugin.lab.bench.preset_conversion import as_markdown, conversion_table, convert
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.runtime.score_logs import KnownScenes, find_logs
+from alpasim_plugin.runs.score_logs import KnownScenes, find_logs
 from evaluators.metrics.presets import preset as find_preset
 
 EPILOG = """

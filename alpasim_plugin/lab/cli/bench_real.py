@@ -12,15 +12,15 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.parts import RendererSpec, resolve_renderer, split_names
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
 from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, unseen_cameras
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
-from alpasim_plugin.plugins.interfaces import Renderer
-from alpasim_plugin.plugins.parts import RendererSpec, resolve_renderer, split_names
-from alpasim_plugin.runtime.cell import make_renderer
+from alpasim_plugin.runs.cell import make_renderer
 from scenarios.load import load_scenario
 
 EPILOG = """

@@ -14,8 +14,9 @@ import typer
 from rich.console import Console
 from torch import nn
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.bench.judge_check import CheckClip, cuboid_card, lane_card, oracle, style_card, sweep
 from alpasim_plugin.lab.cli.training_options import scene_files
 from alpasim_plugin.lab.learned_metrics.nets.files import NAMES, check_digests, file_name, freeze, judges_folder, load_judge, read_judge
@@ -24,7 +25,6 @@ from alpasim_plugin.lab.training.learned_metrics.frames import chosen
 from alpasim_plugin.lab.training.learned_metrics.labels import sequence_labels
 from alpasim_plugin.lab.training.learned_metrics.style import styled_frames
 from alpasim_plugin.lab.training.pair_store import PairDataset
-from alpasim_plugin.nets.checkpoints import file_sha256
 
 app = typer.Typer(no_args_is_help=True, help="Check, freeze and describe the judges: networks that measure images (docs/lab/judges.md).")
 CHECKED = (*NAMES, "fvmd_lk")

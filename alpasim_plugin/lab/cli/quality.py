@@ -12,6 +12,7 @@ from rich.console import Console
 
 from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve, split_names, split_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.bench.quality import RAW, Variant
@@ -22,7 +23,6 @@ from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
 from alpasim_plugin.lab.video_metrics.table import markdown
-from alpasim_plugin.plugins.parts import resolve, split_names, split_settings
 
 EPILOG = """
 Examples:

@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.lab.bench.arm_choice import Choice
 from alpasim_plugin.lab.bench.trained_arms import trained_arms
 from alpasim_plugin.lab.cli import training_options as options
@@ -32,8 +33,7 @@ from alpasim_plugin.lab.training.recipes.recipe import Recipe
 from alpasim_plugin.lab.training.recipes.registry import with_perceptual_weight
 from alpasim_plugin.lab.training.trainer import Schedule
 from alpasim_plugin.lab.video_metrics.image_distance import distance_for_training
-from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.runtime.executors.local import run_dependent
+from alpasim_plugin.runs.executors.local import run_dependent
 
 EVERY_S = 20.0  # between lines of progress
 SHORT_S = 120.0  # a time left that is given in seconds

@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.cache import cache_root
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.cache import cache_root
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, scene_files
 from alpasim_plugin.lab.training.pair_import import PairSources, import_sequence
@@ -22,7 +22,7 @@ from alpasim_plugin.lab.training.pairs import PairRecipe, make_sequence
 from alpasim_plugin.lab.training.scenes import SPLITS
 from alpasim_plugin.renderers.reconstruction import KIND, ensure
 from alpasim_plugin.renderers.reconstruction_key import recipe_of, reconstruction_key
-from alpasim_plugin.runtime.executors.local import map_jobs
+from alpasim_plugin.runs.executors.local import map_jobs
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand
 

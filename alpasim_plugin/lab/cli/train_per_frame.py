@@ -12,6 +12,7 @@ import typer
 from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
+from alpasim_plugin.fixers.network.machine_probe import choose_precision
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.image_sizes import parse_size
@@ -20,7 +21,6 @@ from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PIXEL_VARIANTS,
 from alpasim_plugin.lab.training.ranks import in_ranks
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets.machine_probe import choose_precision
 
 WITHOUT_VIDEO = StreamShares(pairs=0.93, identity=0.07, video=0.0, damaged_video=0.0)
 EPILOG = """

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
@@ -25,7 +26,6 @@ from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary, w
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.gaussians.scene.degrade import log_actors
-from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug
 from alpasim_plugin.renderers.gaussian import scene_of
 from scenarios.load import load_scenario

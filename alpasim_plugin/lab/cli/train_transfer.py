@@ -19,7 +19,7 @@ from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
 from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe, make_photograph_pairs
 from alpasim_plugin.lab.training.transfer_pairs import make_transfer_sequence
 from alpasim_plugin.lab.training.transfer_scenes import SPLITS, Split, TransferScene, check_frozen, transfer_scene
-from alpasim_plugin.runtime.executors.local import map_jobs
+from alpasim_plugin.runs.executors.local import map_jobs
 from scenarios.drive import DRIVE_FILE
 from scenarios.load import load_scenario
 

@@ -13,12 +13,12 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.training.model_card import curves
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.recipes.recipe import Stage
 from alpasim_plugin.lab.training.trainer import LOG_FILE
 from alpasim_plugin.lab.video_metrics.image_distance import distance_for_training
-from alpasim_plugin.nets.checkpoints import file_sha256
 
 Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; the split 'train' is used.")]
 Size = Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Train on sequences of this image size alone.")]

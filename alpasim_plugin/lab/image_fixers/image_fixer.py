@@ -18,14 +18,14 @@ from alpasim_plugin.block_fixers.networks import LATENT, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
+from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import Views, check_continues, group_views
 from alpasim_plugin.lab.image_fixers.pipeline import fix_images, sample_window
 from alpasim_plugin.lab.image_fixers.settings import MaplessSettings, NoiseWindowSettings, RenderStepSettings
-from alpasim_plugin.nets.machine_probe import take_threads
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from alpasim_plugin.block_fixers.layers import PATCH
 from alpasim_plugin.block_fixers.networks import Networks, decode
 from alpasim_plugin.block_fixers.pipeline import Stage, no_clock
 from alpasim_plugin.block_fixers.sampling import flow_step
+from alpasim_plugin.fixers.network.schedule import TABLE
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderLevel, RenderStepSettings
-from alpasim_plugin.nets.schedule import TABLE
 
 LATENT_KEY, CONDITION_KEY = "x_embedder.proj.1.weight", "additional_patch_embedding.proj.1.weight"
 AREA = PATCH * PATCH

@@ -9,8 +9,8 @@ from pydantic import Field, field_validator, model_validator
 
 from alpasim_plugin.block_fixers.settings import LatentFixerSettings, latent_kind
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.schedule import TABLE
 from alpasim_plugin.fixers.settings import BundleKind, Part, Positive, Unit, check_no_blocks, check_steps, counted_steps
-from alpasim_plugin.nets.schedule import TABLE
 
 if TYPE_CHECKING:
     pass

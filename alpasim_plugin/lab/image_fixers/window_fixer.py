@@ -21,6 +21,7 @@ from alpasim_plugin.block_fixers.clips import SIDE, crop_clip, to_clip, to_image
 from alpasim_plugin.block_fixers.networks import LATENT
 from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -28,7 +29,6 @@ from alpasim_plugin.fixers.views import Views, group_views
 from alpasim_plugin.lab.image_fixers.image_fixer import MaplessFixer
 from alpasim_plugin.lab.image_fixers.pipeline import sample_window
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings
-from alpasim_plugin.plugins.interfaces import BlockRule
 
 WHOLE_CLIP = sys.maxsize  # frames of a block: as many as there are
 

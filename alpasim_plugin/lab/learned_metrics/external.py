@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.io.reading import parsing, read_json_object
 from alpasim_plugin.lab.learned_metrics.fvmd import EVERY, FRAMES, GRID
 from alpasim_plugin.lab.learned_metrics.lanes import resampled
 from alpasim_plugin.lab.learned_metrics.types import Cuboid, Lane3D

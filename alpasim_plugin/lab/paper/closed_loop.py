@@ -15,7 +15,7 @@ from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.tables import markdown_table, paper_against_ours
 from alpasim_plugin.lab.video_metrics.charts import DPI, finish
 from alpasim_plugin.lab.video_metrics.facts import KNOWN
-from alpasim_plugin.run_folder.sides import Row, by_renderer
+from alpasim_plugin.log.run_folder.sides import Row, by_renderer
 from evaluators.report.ci import cell_text, metric_label
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, metric_rows, p_text, pair_rows

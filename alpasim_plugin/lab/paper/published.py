@@ -10,8 +10,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.config import load_yaml, validate
 
 DOING = "reading the paper's numbers"
 CELL = re.compile(r"\d*\.?\d+(±\d*\.?\d+)?")

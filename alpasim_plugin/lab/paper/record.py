@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.io.reading import parsing, read_json_object
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.lab.paper.claims import CLAIMS, PER_FRAME, PSNR, STANDS_IN
 from alpasim_plugin.lab.paper.measured import Difference
 from alpasim_plugin.lab.paper.verdict import ORACLE, Evidence

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.parts import build, resolve
+from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.io.atomic import write_bytes
-from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.lab.bench.quality import Variant, run_variant
 from alpasim_plugin.lab.bench.quality_run import quality_clip
 from alpasim_plugin.lab.training.drive_pairs import DRIVE, Shot, write_drive_sequence
@@ -32,7 +33,6 @@ from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.plugins.parts import build, resolve
 
 DOING = "adapting a fixer"
 FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to judge by

@@ -17,8 +17,8 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
 from alpasim_plugin.block_fixers.sampling import finalise, flow_step
+from alpasim_plugin.fixers.network.schedule import NoiseLevel, interpolant
 from alpasim_plugin.lab.training.recipes.recipe import Attention
-from alpasim_plugin.nets.schedule import NoiseLevel, interpolant
 
 
 def causal_rollout(

@@ -14,7 +14,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, U8
-from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
+from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 
 FROM = "car"
 OTHERS = ("truck", "cyclist", "pedestrian", "other")

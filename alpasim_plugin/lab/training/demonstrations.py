@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.atomic import atomic_folder, write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, quat_from_yaw, se3
+from alpasim_plugin.core.reading import read_json_as, read_json_object
+from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Route, Scenario
-from alpasim_plugin.io.atomic import atomic_folder, write_json
-from alpasim_plugin.io.reading import read_json_as, read_json_object
-from alpasim_plugin.io.reading.arrays import open_npy
 from alpasim_plugin.lab.training.perturbed_rollouts import PerturbedRollout, RolloutState, perturbed_rollouts
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M, expert_path, expert_speeds, leader_on
 from alpasim_plugin.renderers import make_renderer

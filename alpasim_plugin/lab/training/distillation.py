@@ -19,6 +19,7 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sampling import mixed_source
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.seeding import derive_seed, stream
+from alpasim_plugin.fixers.network.schedule import steps
 from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.lab.training.causal_rollout import causal_rollout
 from alpasim_plugin.lab.training.clip_batches import ClipBatches
@@ -28,7 +29,6 @@ from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transf
 from alpasim_plugin.lab.training.shared_rollout import T_SOURCE, Sample
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import Loss
-from alpasim_plugin.nets.schedule import steps
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.sampling import flow_step
+from alpasim_plugin.fixers.network.schedule import SHIFT, TABLE, interpolant
 from alpasim_plugin.lab.training.shared_rollout import channel_weighted
-from alpasim_plugin.nets.schedule import SHIFT, TABLE, interpolant
 
 Score = Callable[[Tensor, Tensor], Tensor]  # x (B, C, N, H, W), sigma (B,) -> velocity like x
 NORMALISER_FLOOR = 1e-6

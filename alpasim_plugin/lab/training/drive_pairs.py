@@ -19,8 +19,11 @@ import torch
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F32, U8, CameraSpec, Photograph, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.drives.build import POINTS_FILE
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.drive import fit_drive
@@ -31,11 +34,8 @@ from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
 from alpasim_plugin.lab.training.photograph_pairs import DOING, PhotographPairs, PhotographRecipe
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.recorded import posed_photograph
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 
 DRIVE = "drive"  # the family of these sequences
 

@@ -18,13 +18,13 @@ from torch import Tensor, nn
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sampling import context_level, mixed_source
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.fixers.network.schedule import TABLE, interpolant, shifted
 from alpasim_plugin.lab.training.clip_batches import ClipBatches, Drawn
 from alpasim_plugin.lab.training.recipes.recipe import Attention, StageInputs
 from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
 from alpasim_plugin.lab.training.shared_rollout import T_SOURCE, Sample, channel_weighted
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import Loss
-from alpasim_plugin.nets.schedule import TABLE, interpolant, shifted
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import read_json_as
+from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.lab.training.scenes import TEST_SPLITS
 
 DOING = "checking test scenes"

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.types import U8, Bool
-from alpasim_plugin.semantic_map.style import COLOURS
+from alpasim_plugin.fixers.semantic_map.style import COLOURS
 
 Kind = Literal["true", "missing", "unpainted", "shifted", "other"]
 CHANCES: dict[Kind, float] = {"true": 0.58, "missing": 0.12, "unpainted": 0.12, "shifted": 0.12, "other": 0.06}

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
-from alpasim_plugin.nets.schedule import TABLE, interpolant
+from alpasim_plugin.fixers.network.schedule import TABLE, interpolant
 
 LOG_MEAN, LOG_STD = 0.7, 1.6  # of s, as SVD's training has them
 Error = Callable[[Tensor, Tensor], Tensor]  # v_hat - v (B, C, T, H, W), t (B,) -> the same shape

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import parsing, read_json
+from alpasim_plugin.core.reading.arrays import open_npy
+from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.types import F64, U8
-from alpasim_plugin.io.reading import parsing, read_json
-from alpasim_plugin.io.reading.arrays import open_npy
-from alpasim_plugin.io.reading.images import read_image
 from alpasim_plugin.lab.training.pair_store import Pair, write_sequence
 from alpasim_plugin.log.video import VideoReader
 

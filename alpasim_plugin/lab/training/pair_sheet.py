@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
 
 EVERY = 5  # every 5th frame is measured, since consecutive frames are similar

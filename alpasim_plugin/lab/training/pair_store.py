@@ -24,11 +24,11 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import read_json_object
+from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.types import F64, I64, U8
-from alpasim_plugin.io.atomic import atomic_folder
-from alpasim_plugin.io.reading import read_json_object
-from alpasim_plugin.io.reading.arrays import open_npy
 
 SEQUENCE_FILE = "sequence.json"
 CONTENT = "content"

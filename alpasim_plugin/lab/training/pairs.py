@@ -10,15 +10,15 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, yaw_of
+from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Scenario
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
-from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.world.ground import ground_pose
 
 DOING = "making training pairs"

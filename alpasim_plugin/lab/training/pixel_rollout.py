@@ -27,10 +27,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelState, pixel_source
+from alpasim_plugin.fixers.network.reference_blend import Sources
+from alpasim_plugin.fixers.network.schedule import interpolant
 from alpasim_plugin.lab.training.grid_term import grid_term
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState, pixel_source
-from alpasim_plugin.nets.reference_blend import Sources
-from alpasim_plugin.nets.schedule import interpolant
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)

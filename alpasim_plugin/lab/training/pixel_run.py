@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, save_bundle
+from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.io.reading.arrays import read_metadata
 from alpasim_plugin.lab.training.episode_references import USUAL_REFERENCES
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.lab.training.model_card import ModelCard, curves
@@ -24,8 +26,6 @@ from alpasim_plugin.lab.training.pixel_task import FrameStreams, PixelTask
 from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PixelVariant
 from alpasim_plugin.lab.training.ranks import ALONE, Ranks, Report
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
-from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 
 BLOCK = re.compile(r"(encode|decode|middle)\w*\.\d+\.")  # a residual block of a stage
 DOING = "training a per-frame generator"

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.seeding import derive_seed, stream
+from alpasim_plugin.fixers.network.pixel_generator import GRID_PX, PixelGenerator, PixelState
 from alpasim_plugin.lab.training.pixel_rollout import Distance, PixelSample, pixel_losses
 from alpasim_plugin.lab.training.pixel_variants import PixelVariant
 from alpasim_plugin.lab.training.ranks import ALONE, Ranks
-from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelGenerator, PixelState
 
 SEEN = 2  # frames of the perceptual term in an update
 

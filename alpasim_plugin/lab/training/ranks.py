@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
-from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
 
 T = TypeVar("T")
 Report = Callable[[int, Mapping[str, float]], None]

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from alpasim_plugin.core.types import F32, U8
-from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
+from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 
 CLASSES = ("boundary", "white line", "yellow line", "crosswalk", "stop line", "vehicle", "other road user")
 _LINES = {

@@ -23,7 +23,7 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import GraphCache
 from alpasim_plugin.block_fixers.sampling import finalise, flow_step, mixed_source
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.schedule import interpolant
+from alpasim_plugin.fixers.network.schedule import interpolant
 
 FlowHistory = Literal["own", "clean", "redenoised"]
 Predicted = Literal["own", "redenoised"]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.reading import read_json_lines
+from alpasim_plugin.core.reading import read_json_lines
 from alpasim_plugin.lab.training.trainer import CORE_S, LOG_FILE
 
 SNAPSHOTS = "snapshots"

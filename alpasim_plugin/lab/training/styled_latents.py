@@ -15,9 +15,9 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.settings import STYLES
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.core.atomic import write_array
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.io.atomic import write_array
 from alpasim_plugin.lab.training.appearance import VERSION
 from alpasim_plugin.lab.training.clips import to_tensor
 from alpasim_plugin.lab.training.latent_clips import F16, LatentClip, LatentClips

@@ -18,12 +18,12 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import torch
 from torch import Tensor, nn
 
+from alpasim_plugin.core.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.io.atomic import atomic_file, disk_error, write_safetensors, write_text
-from alpasim_plugin.io.reading import parse_json, parsing, read_text
-from alpasim_plugin.io.reading.arrays import START_ANEW, read_checkpoint
+from alpasim_plugin.core.reading import parse_json, parsing, read_text
+from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
+from alpasim_plugin.fixers.network.checkpoints import listed, load_weights
 from alpasim_plugin.lab.training.ranks import ALONE, Ranks
-from alpasim_plugin.nets.checkpoints import listed, load_weights
 
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log

@@ -13,11 +13,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Degradation
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import read_json_as
 from alpasim_plugin.lab.training.frozen_scenes import FrozenEntry, FrozenSplit
 from alpasim_plugin.lab.training.scene_draws import number
 from alpasim_plugin.lab.training.scene_looks import KNOWN_DAMAGE, draw_damage

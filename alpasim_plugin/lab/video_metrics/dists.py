@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights, weight
 from alpasim_plugin.lab.video_metrics.lpips import TRUNKS, Trunk
 from alpasim_plugin.lab.video_metrics.perceptual_net import check_images
-from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, weight
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SMALL = 1e-6  # the constants of both similarities

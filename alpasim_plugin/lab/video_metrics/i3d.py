@@ -15,7 +15,7 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, U8
-from alpasim_plugin.nets.checkpoints import file_sha256
+from alpasim_plugin.fixers.network.checkpoints import file_sha256
 
 FILE = "i3d_torchscript.pt"
 LOGITS = 400

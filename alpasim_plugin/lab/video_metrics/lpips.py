@@ -16,8 +16,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.checkpoints import StateDict, file_sha256, load_weights, weight
 from alpasim_plugin.lab.video_metrics.perceptual_net import check_images
-from alpasim_plugin.nets.checkpoints import StateDict, file_sha256, load_weights, weight
 
 Kind = Literal["alex", "vgg"]
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)

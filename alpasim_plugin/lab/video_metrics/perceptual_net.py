@@ -14,10 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_safetensors
-from alpasim_plugin.io.reading.arrays import read_metadata
-from alpasim_plugin.nets.checkpoints import load_weights, weight
+from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.fixers.network.checkpoints import load_weights, weight
 
 NAME = "perceptual-syn"
 FORMAT = "simrun-perceptual-1"

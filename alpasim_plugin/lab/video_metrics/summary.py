@@ -14,7 +14,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.lab.video_metrics.facts import FACTS, KNOWN, MS, SOMETIMES, WARP
-from alpasim_plugin.run_folder.sides import by_renderer
+from alpasim_plugin.log.run_folder.sides import by_renderer
 from evaluators.statistics.intervals import t_interval
 from evaluators.statistics.paired import compare
 

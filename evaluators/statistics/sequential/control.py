@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.plugins.parts import digest
-from alpasim_plugin.run_folder.sides import Row, by_renderer
+from alpasim_plugin.log.run_folder.sides import Row, by_renderer
 from evaluators.statistics.sequential.draws import Draws, Strata, families_of, stratified, without_replacement
 from evaluators.statistics.sequential.question import MetricQuestion
 

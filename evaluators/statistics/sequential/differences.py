@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.types import F64, Bool, Direction
-from alpasim_plugin.run_folder.sides import Side
+from alpasim_plugin.log.run_folder.sides import Side
 
 
 @dataclass(frozen=True)

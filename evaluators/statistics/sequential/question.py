@@ -10,10 +10,10 @@ from typing import Any, Literal, NotRequired
 
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.checksums import read_sealed, write_sealed
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.core.types import Direction, MetricInfo
-from alpasim_plugin.io.checksums import read_sealed, write_sealed
-from alpasim_plugin.io.reading.files import as_shape
 from evaluators.metrics import METRICS
 from evaluators.statistics.sequential.asymptotic import FIRST_LOOK
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from alpasim_plugin.core.checksums import sha256_of
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.lab.bench.drives import read_drives
 from tests.report.make_run import Plan, make_run
 

@@ -12,8 +12,8 @@ import torch
 from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.bench.fixer_speed import measure
-from alpasim_plugin.nets.checkpoints import load_weights
 from tests.block_fixers.fixer_cases import small_settings as settings
 from tests.lab.bench.small_clip import driving_clip
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.lab.bench import regime
 from alpasim_plugin.lab.bench.quality import Variant
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 
 
 def test_a_history_is_the_own_output_the_truth_or_nothing() -> None:

@@ -11,13 +11,13 @@ from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, U8, Scenario
 from alpasim_plugin.fixers import fixer_settings
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.bench.map_error import CONFIGURATIONS, MapShift, shifted_maps
 from alpasim_plugin.lab.bench.paper import black_map, grouped, shifted
 from alpasim_plugin.lab.paper import wrong_map
 from alpasim_plugin.lab.paper.measured import Measured
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
 

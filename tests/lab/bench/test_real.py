@@ -13,11 +13,11 @@ from torch import Tensor
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Renderer
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.lab.bench import colour_video_vdp
 from alpasim_plugin.lab.bench.real import METRICS, Judges, intervals, measure_drive, shots_of
 from alpasim_plugin.lab.cli import bench_real
-from alpasim_plugin.plugins.interfaces import BlockRule, Renderer
 from alpasim_plugin.renderers import make_renderer
 from tests.gaussians.scene_maps import straight
 from tests.renderers.recorded_drive import EXPOSURE, SKY_LEVEL, recorded_drive

@@ -16,7 +16,9 @@ from alpasim_plugin.block_fixers.settings import CLEAR, STYLES, OneFixerSettings
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.gaussians.scene.builder import street_lights
 from alpasim_plugin.lab.training.appearance import lights_of_posts
 from alpasim_plugin.lab.training.clip_batches import BatchForm
@@ -26,8 +28,6 @@ from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_attention
 from alpasim_plugin.lab.training.seen_scene import restyle_video, scene_of, seen_frames
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.block_fixers.fixer_cases import run_blocks, small_settings

@@ -16,6 +16,7 @@ from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
 from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.distillation import Distillation
@@ -25,7 +26,6 @@ from alpasim_plugin.lab.training.recipes.recipe import Recipe, Stage
 from alpasim_plugin.lab.training.recipes.registry import by_name, recipe_of, with_objective
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
-from alpasim_plugin.nets.checkpoints import load_weights
 from tests.block_fixers.fixer_cases import SMALL_DIT, fixer, run_blocks
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.test_generator import FORM, clips_of, data  # noqa: F401 - data is a fixture

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.style import COLOURS
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.style import COLOURS
-from tests.semantic_map.test_draw import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
+from tests.fixers.test_draw import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
 
 LABELS = {"truck": "truck", "cyclist": "rider", "pedestrian": "person", "other": "dog"}
 

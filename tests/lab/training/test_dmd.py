@@ -12,6 +12,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.fixers.network.schedule import steps
 from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.lab.training.causal_rollout import causal_rollout
 from alpasim_plugin.lab.training.distillation import ScoreNet
@@ -21,7 +22,6 @@ from alpasim_plugin.lab.training.recipes.causal_arms import long_blocks
 from alpasim_plugin.lab.training.recipes.recipe import Attention
 from alpasim_plugin.lab.training.shared_rollout import Sample
 from alpasim_plugin.lab.training.tail_drop import TailDrop, visible_share
-from alpasim_plugin.nets.schedule import steps
 
 N = 4
 TEXT = torch.zeros(1, 1, 8)

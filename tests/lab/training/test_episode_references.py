@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import U8, Actor, Box, RecordedFrame, Trajectory
+from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.lab.training.episode_references import (
     SLOTS,
     ReferenceDraw,
@@ -20,7 +21,6 @@ from alpasim_plugin.lab.training.episode_references import (
 from alpasim_plugin.lab.training.map_errors import CHANCES, MapError, draw_map_error, is_paint, with_error
 from alpasim_plugin.lab.training.pair_store import PairSequence, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
-from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from tests.lab.training.pair_files import make, pair
 
 FRAMES, HEIGHT, WIDTH = 6, 32, 48

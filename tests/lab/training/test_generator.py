@@ -19,9 +19,10 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.io.reading.arrays import read_metadata
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
@@ -34,7 +35,6 @@ from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_attenti
 from alpasim_plugin.lab.training.recipes.start import widen_map
 from alpasim_plugin.lab.training.shared_rollout import Objectives
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets.checkpoints import load_weights
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.pair_files import make, pair

@@ -16,17 +16,17 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.refine import refine_frames
-from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.training.recipes.image_arms import IMAGE_ARMS
 from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets.checkpoints import load_weights
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.pair_files import make
 

@@ -12,6 +12,8 @@ import torch
 
 from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Fixer
+from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle
@@ -21,8 +23,6 @@ from alpasim_plugin.lab.bench.whole_clip_images import whole_clip_images
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
-from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
-from alpasim_plugin.plugins.parts import resolve_renderer
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings
 

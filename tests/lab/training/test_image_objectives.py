@@ -16,6 +16,7 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings, make_fixer
+from alpasim_plugin.fixers.network.schedule import names
 from alpasim_plugin.lab.image_fixers.pipeline import CONDITION_KEY, LATENT_KEY, euler, fixed_step, share_embedding
 from alpasim_plugin.lab.image_fixers.settings import RenderLevel, RenderStepSettings
 from alpasim_plugin.lab.training.cut_outs import cut_out, soft_mask
@@ -30,7 +31,6 @@ from alpasim_plugin.lab.training.noise_window import (
 )
 from alpasim_plugin.lab.training.render_step import RenderStep, picture_losses, warp_term
 from alpasim_plugin.lab.training.warping import flow_between, warping_loss
-from alpasim_plugin.nets.schedule import names
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings
 

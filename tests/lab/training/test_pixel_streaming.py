@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.fixers.network.pixel_generator import pixel_noise
 from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
-from alpasim_plugin.nets.pixel_generator import pixel_noise
 from tests.examples import first_of
 from tests.fixers.clip_cases import SIZE, pixels
 from tests.fixers.test_pixel_fixer import FRAMES, MAPS, at, generator, run, session, write_bundle

@@ -11,15 +11,15 @@ from torch import Tensor
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
+from alpasim_plugin.fixers.network.checkpoints import load_weights
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, pixel_source
+from alpasim_plugin.fixers.network.reference_blend import Sources, mix
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.grid_term import grid_term
 from alpasim_plugin.lab.training.pixel_rollout import ROAD_USER, PixelObjectives, PixelSample, choice_term, pixel_losses
 from alpasim_plugin.lab.training.pixel_run import PixelRun, initial_generator, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
-from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, pixel_source
-from alpasim_plugin.nets.reference_blend import Sources, mix
 
 SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
 FRAMES = 3

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.lab.training.pixel_run import train_per_frame
 from alpasim_plugin.lab.training.ranks import ALONE, Ranks, Report, in_ranks
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from tests.lab.training.test_pixel_training import run_of, weights
 
 

@@ -15,9 +15,9 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.fixers.network.schedule import interpolant
 from alpasim_plugin.lab.training.perceptual_term import DecodedDistance
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
-from alpasim_plugin.nets.schedule import interpolant
 from tests.examples import first_of
 
 N, H, W = 8, 4, 4

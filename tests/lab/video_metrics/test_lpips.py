@@ -13,9 +13,9 @@ import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, available, distance_for_training, load_distance
 from alpasim_plugin.lab.video_metrics.lpips import LPIPS, TRUNKS, Kind, load_lpips
-from alpasim_plugin.nets.checkpoints import file_sha256
 
 KINDS: tuple[Kind, ...] = ("alex", "vgg")
 

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.video_metrics.dists import DISTS, HEADS, load_dists
 from alpasim_plugin.lab.video_metrics.i3d import FILE, i3d_features, load_i3d
 from alpasim_plugin.lab.video_metrics.lpips import TRUNKS
-from alpasim_plugin.nets.checkpoints import file_sha256
 
 # VGG-16 with a sixteenth of its channels: the published one costs seconds.
 SMALL = replace(

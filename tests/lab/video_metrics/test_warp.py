@@ -9,8 +9,8 @@ import pytest
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
+from alpasim_plugin.fixers.semantic_map.style import COLOURS
 from alpasim_plugin.lab.video_metrics.warp import backward_flow, late_window, road_mask, warp_l1
-from alpasim_plugin.semantic_map.style import COLOURS
 
 RNG = stream("video", 0, "warp")
 

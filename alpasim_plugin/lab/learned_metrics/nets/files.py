@@ -15,15 +15,15 @@ from typing import Literal, get_args
 
 from torch import nn
 
+from alpasim_plugin.core.atomic import write_json, write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.atomic import write_json, write_safetensors
-from alpasim_plugin.io.reading import read_json_object
-from alpasim_plugin.io.reading.arrays import read_metadata
+from alpasim_plugin.core.reading import read_json_object
+from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights
 from alpasim_plugin.lab.learned_metrics.nets.cuboid_net import CuboidNet
 from alpasim_plugin.lab.learned_metrics.nets.lane_net import LaneNet
 from alpasim_plugin.lab.learned_metrics.nets.style_net import StyleNet
 from alpasim_plugin.lab.learned_metrics.nets.video_net import VideoNet
-from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
 
 JudgeName = Literal["lane", "cuboid", "video", "style"]
 NAMES: tuple[JudgeName, ...] = get_args(JudgeName)

@@ -17,10 +17,10 @@ from typing import Any
 import torch
 
 from alpasim_plugin.block_fixers.networks import load_tiny_vae
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.lab.training.arms.plan import INITIAL, Plan, Training, initial_name
 from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, FixerRun, Report, TrainableSettings, train_stage

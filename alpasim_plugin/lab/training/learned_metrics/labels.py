@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Scenario
-from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.lab.learned_metrics.types import Cuboid, Lane3D
 from alpasim_plugin.lab.training.learned_metrics.truth import VEHICLES, lanes_seen, vehicles_seen, world_lines
 from alpasim_plugin.lab.training.pair_store import PairSequence

@@ -13,11 +13,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.settings import STYLES
+from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, U8, Scenario
-from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.lab.learned_metrics.nets.layers import initialise
 from alpasim_plugin.lab.learned_metrics.nets.style_net import StyleNet, style_input
 from alpasim_plugin.lab.training.appearance import restyle

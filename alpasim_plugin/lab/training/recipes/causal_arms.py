@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+from alpasim_plugin.fixers.network.schedule import SHIFT
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
 from alpasim_plugin.lab.training.clip_batches import Seen
 from alpasim_plugin.lab.training.distillation import Distillation
@@ -16,7 +17,6 @@ from alpasim_plugin.lab.training.flow_matching import FlowMatching
 from alpasim_plugin.lab.training.recipes.recipe import INIT_BI, Attention, Recipe, Stage, whole_clip
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import PartSchedule
-from alpasim_plugin.nets.schedule import SHIFT
 
 STUDENT = PartSchedule(rate=1 / 15, betas=(0.0, 0.999), clip=10.0)
 CRITIC = PartSchedule(rate=1 / 75, betas=(0.0, 0.999), clip=10.0)

@@ -1,0 +1,135 @@
+"""What is made once, by the first process that needs it, while the others wait: folders by their content, and measurements of a machine.
+
+CACHE / KIND / KEY/        what was made; it appears atomically
+             / KEY.lock     held by the process that makes it
+FOLDER / NAME.json         what was measured by one process of a run on a node: others would slow it down, and could choose differently
+       / NAME.lock
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from alpasim_plugin.core import places
+from alpasim_plugin.core.atomic import atomic_folder, write_json
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.lock import one_writer
+from alpasim_plugin.core.reading.files import read_json_object
+
+T = TypeVar("T")
+DOING, DO_THIS = "writing to the cache", "free disk space, or name a writable folder in SIMRUN_CACHE"
+MEASURING = "measuring the machine"
+KEPT_S = 7 * 86400.0  # a folder of an earlier run, which nobody else removes
+
+_taken: dict[tuple[Path | None, str], Mapping[str, Any]] = {}
+_folder: Path | None = None
+
+
+def cache_root() -> Path:
+    """Return the folder of the cache (`alpasim_plugin.core.places.cache`).
+
+    Raises:
+        InfrastructureError: No folder can be written.
+    """
+    found = places.cache().path
+    if found is None:
+        raise InfrastructureError(DOING, "the cache", "no folder can be written", places.DO_THIS)
+    return found
+
+
+def cached(kind: str, key: str, make: Callable[[Path], None], read: Callable[[Path], T], what: str, *, again: bool = False) -> T:
+    """Return what ``read`` finds under a key, made first if it is not there.
+
+    Several processes may ask at once: one makes it, the others wait. A folder that ``read`` refuses is made anew, with a warning.
+
+    Args:
+        kind: Sub-folder of the cache.
+        key: Name by content.
+        make: Fills an empty folder.
+        read: Reads a filled one.
+        what: What is made, for the lines on standard error.
+        again: Make it even if it is there.
+
+    Raises:
+        InfrastructureError: The cache cannot be written.
+        InputError: What was just made cannot be read.
+    """
+    folder = cache_root() / kind / key
+    if not again and folder.exists():
+        found = _readable(folder, read, what)
+        if found is not None:
+            return found
+    lock = folder.with_name(f"{key}.lock")
+    with one_writer(lock, DOING, what, wait=True, waiting=lambda text: print(text, file=sys.stderr, flush=True), do_this=DO_THIS):
+        for left_over in folder.parent.glob(f".{key}.*.tmp"):  # of a process that was killed while it made this entry
+            shutil.rmtree(left_over)
+        found = None if again or not folder.exists() else _readable(folder, read, what, warn=False)
+        if found is None:
+            _make(folder, make, what)
+            found = read(folder)
+        return found
+
+
+def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = True) -> T | None:
+    try:
+        return read(folder)
+    except InputError as error:
+        if warn:
+            print(f"warning: {what} is damaged ({error.with_what}: {error.found}); making it again", file=sys.stderr, flush=True)
+        return None
+
+
+def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
+    print(f"{what} ...", file=sys.stderr, flush=True)
+    began = time.perf_counter()
+    with atomic_folder(folder, DOING, DO_THIS) as partial:
+        make(partial)
+    print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
+
+
+def share_measurements(folder: Path | None) -> None:
+    """Share what this process measures from now on with the others that name the same folder; None: with nobody.
+
+    Args:
+        folder: Of the run, on a file system of this node.
+    """
+    global _folder
+    _folder = folder
+
+
+def measured(name: str, measure: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return a measurement, taken by this process unless another one of the run on this node has.
+
+    Args:
+        name: What is measured; part of a file name.
+        measure: Takes it; its values must fit into JSON.
+
+    Raises:
+        InfrastructureError: The folder cannot be written.
+        InputError: The file was damaged.
+    """
+    folder = _folder
+    if (folder, name) not in _taken:
+        _taken[folder, name] = measure() if folder is None else _once(folder, name, measure)
+    return _taken[folder, name]
+
+
+def _once(folder: Path, name: str, measure: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    path = folder / f"{name}.json"
+    with one_writer(folder / f"{name}.lock", MEASURING, f"{name} of this machine", wait=True, waiting=lambda said: None):
+        if not path.exists():
+            _forget(folder.parent)
+            write_json(path, measure(), MEASURING)
+        return read_json_object(path, MEASURING)
+
+
+def _forget(root: Path) -> None:
+    """Remove folders of runs that began long ago."""
+    for folder in root.iterdir():
+        if folder.is_dir() and time.time() - folder.stat().st_mtime > KEPT_S:
+            shutil.rmtree(folder, ignore_errors=True)  # another process may do the same

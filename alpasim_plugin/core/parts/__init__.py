@@ -1,0 +1,35 @@
+"""Parts by name: what can be named, what a name stands for, and what identifies it.
+
+A name is resolved once, into a `PartSpec` that carries the part's identity; a worker process only builds it. Built-in parts
+(`alpasim_plugin.core.parts.spec`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
+"""
+
+from alpasim_plugin.core.interfaces import complete
+from alpasim_plugin.core.parts.resolve import (
+    RendererSpec,
+    find,
+    names,
+    overrides_of,
+    resolve,
+    resolve_renderer,
+    split_names,
+    split_settings,
+    unidentified,
+)
+from alpasim_plugin.core.parts.spec import PartSpec, build, digest
+
+__all__ = [
+    "PartSpec",
+    "RendererSpec",
+    "build",
+    "complete",
+    "digest",
+    "find",
+    "names",
+    "overrides_of",
+    "resolve",
+    "resolve_renderer",
+    "split_names",
+    "split_settings",
+    "unidentified",
+]

@@ -1,0 +1,332 @@
+"""What can be named, found the same way in every process, and from a name on the command line to a resolved part."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from alpasim_plugin.core.config import apply_overrides, validate
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import Declaration
+from alpasim_plugin.core.lazy import installed, installed_names
+from alpasim_plugin.core.parts.source import absolute_target, code_digest, file_of, is_target, load, require_unedited, split_address
+from alpasim_plugin.core.parts.spec import BUILTIN, KINDS, MODES, KindName, PartSpec, digest, file_digest, part_digest
+from alpasim_plugin.core.yaml_positions import Document
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A named part."""
+
+    name: str
+    target: str  # package.module:attribute
+    help: str
+
+
+def names(kind: KindName) -> dict[str, str]:
+    """Return every known name of a kind with one line of help, built-in names first."""
+    return {name: entry.help for name, entry in entries(kind).items()}
+
+
+def entries(kind: KindName) -> Mapping[str, Entry]:
+    """Return every known part of a kind by name, built-in ones first.
+
+    Raises:
+        InputError: Two packages claim one name.
+    """
+    found = {name: Entry(name, target, help_text) for name, (target, help_text) in BUILTIN[kind].items()}
+    taken = {name: entry.target for name, entry in found.items()}
+    others = installed_names(KINDS[kind].group, taken, kind)
+    return found | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
+
+
+def find(kind: KindName, name: str) -> Entry:
+    """Return the part with a name.
+
+    Raises:
+        InputError: Unknown name (with the nearest known one), or a name claimed twice.
+    """
+    known = entries(kind)
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    do = f"{hint}known: {', '.join(known)}; or name one of your own as package.module:Class"
+    raise InputError(f"looking up a {kind}", f"name {name!r}", f"no {kind} has that name", do)
+
+
+BASE = "3dgs"  # the renderer below a fixer where nothing else is said
+DOING = "choosing a renderer"
+PLAIN_KINDS = ("renderer", "evaluator", "controller")  # whose shipped parts declare nothing; a test holds them to it
+
+
+@dataclass(frozen=True)
+class RendererSpec:
+    """A renderer, or a fixer over one.
+
+    Example:
+        >>> str(resolve_renderer("onefixer@2")), str(resolve_renderer("clean"))
+        ('onefixer@2+3dgs', 'clean')
+    """
+
+    name: str  # as a user named it: what tables show
+    base: PartSpec
+    fixer: PartSpec | None = None
+
+    def __str__(self) -> str:
+        return self.base.name if self.fixer is None else f"{self.fixer.name}+{self.base.name}"
+
+    @property
+    def digest(self) -> str | None:
+        """Give what identifies both; None where either has no digest."""
+        parts = [part.digest for part in (self.base, self.fixer) if part is not None]
+        return None if None in parts else digest(parts)
+
+
+def resolve(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpec:
+    """Resolve the name of a part.
+
+    Args:
+        kind: Its kind.
+        name: A registered name (a fixer also as ``NAME@STEPS``), ``package.module:Class``, ``path/file.py:Class``, ``scheme://address``
+            where a part is registered as ``scheme://``, or ``exec:COMMAND``.
+        overrides: ``KEY=VALUE`` of its settings.
+
+    Raises:
+        InputError: Unknown name (with the nearest), a failing import, a bad setting or address, or a declared file that cannot be read.
+    """
+    spec = unidentified(kind, name, overrides)
+    return _described(spec, None if _declares_nothing(kind, spec.target) else load(spec.target, kind))
+
+
+def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpec:
+    """Resolve a name as far as building the part needs it: no file is read, and there is no digest. See `resolve`."""
+    plain, steps, address = name, None, None
+    if is_target(name):
+        target = absolute_target(name)
+    else:
+        scheme, rest = split_address(name)
+        if scheme:
+            plain, address = scheme, rest
+        elif kind == "fixer":
+            plain, steps = split_steps(name)
+        target = find(kind, plain).target
+    at_steps = () if steps is None else (f"steps={steps}",)
+    if _declares_nothing(kind, target):
+        return PartSpec(kind, name, target, None, address=address)
+    factory = load(target, kind)
+    if address is not None and hasattr(factory, "check_address"):
+        factory.check_address(address)
+    settings = _settings(kind, plain, factory, (*at_steps, *overrides))
+    return PartSpec(kind, name, target, settings, address=address)
+
+
+def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
+    """Resolve ``RENDERER``, ``FIXER`` (over `BASE`) or ``FIXER+RENDERER``; ``@STEPS`` and ``[KEY=VALUE,...]`` belong to the fixer.
+
+    Args:
+        name: Renderer and fixer as `resolve` takes them: ``clean``, ``onefixer@2``, ``onefixer[references=0]``,
+            ``onefixer+my.module:MyRenderer``.
+        overrides: ``KEY=VALUE`` of the fixer's settings, ignored where there is none; ``RENDERER:KEY=VALUE`` counts for the renderer of
+            that name alone.
+
+    Raises:
+        InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one without the weights that it needs.
+    """
+    plain, own = split_settings(name)
+    overrides = (*overrides_of(name, overrides), *own)
+    front, plus, base = plain.partition("+")
+    if not plus:
+        if own and front in entries("renderer"):
+            do = "leave the brackets out, or name a fixer: onefixer[references=0]"
+            raise InputError(DOING, f"renderer {name!r}", f"{front!r} is no fixer: it has no settings for brackets", do)
+        if front in entries("renderer") or "://" in front or (is_target(front) and not _is_fixer(front)):
+            return RendererSpec(name, resolve("renderer", front))
+        base = BASE
+    else:
+        front, base = _steps_to_front(front, base)
+    if not is_target(front):
+        _require_fixer(plain, front, bool(plus))
+    fixer = _in_the_loop(resolve("fixer", front, overrides))
+    return RendererSpec(name, resolve("renderer", base), replace(fixer, name=f"{fixer.name}[{','.join(own)}]") if own else fixer)
+
+
+def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
+    """Split the settings in brackets off a name.
+
+    Raises:
+        InputError: Brackets without ``KEY=VALUE`` in them, or more than one pair.
+
+    Example:
+        >>> split_settings("onefixer[references=0,precision=fp32]+clean")
+        ('onefixer+clean', ('references=0', 'precision=fp32'))
+    """
+    if "[" not in name:
+        return name, ()
+    match = re.fullmatch(r"([^\[\]]+)\[([^\[\]]+)\]([^\[\]]*)", name)
+    settings = tuple(text.strip() for text in match[2].split(",")) if match else ()
+    if match is None or not all(re.fullmatch(r"[\w.]+=.+", text) for text in settings):
+        raise InputError(DOING, f"renderer {name!r}", "no settings in its brackets", "write FIXER[KEY=VALUE,...]: onefixer[references=0]")
+    return match[1] + match[3], settings
+
+
+def split_names(text: str) -> list[str]:
+    """Split a list of names at its commas, but for those in brackets.
+
+    Example:
+        >>> split_names("3dgs, onefixer[references=0,recording=past]")
+        ['3dgs', 'onefixer[references=0,recording=past]']
+    """
+    return [name.strip() for name in re.split(r",(?![^\[]*\])", text) if name.strip()]
+
+
+def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
+    """Return the settings of one renderer's fixer: those for all, then those for it alone.
+
+    Example:
+        >>> overrides_of("difix", ["difix:window=2", "precision=bf16", "gsfix3d:steps=4"])
+        ('precision=bf16', 'window=2')
+    """
+    named = [(text.partition("=")[0].rpartition(":")[0], text) for text in overrides]
+    own = (text[len(label) + 1 :] for label, text in named if label == renderer)
+    return (*(text for label, text in named if not label), *own)
+
+
+def split_steps(name: str) -> tuple[str, int | None]:
+    """Split ``NAME@STEPS``.
+
+    Example:
+        >>> split_steps("onefixer@2"), split_steps("onefixer")
+        (('onefixer', 2), ('onefixer', None))
+    """
+    plain, at, count = name.partition("@")
+    if at and not re.fullmatch("[1-9][0-9]?", count):
+        found = f"{count!r} after @ is no step count"
+        raise InputError("choosing a fixer", f"name {name!r}", found, "write NAME@STEPS, such as onefixer@2")
+    return plain, int(count) if at else None
+
+
+def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> Declaration:
+    """Return what a factory declares: the result of its ``describe(settings)``, or its attributes of the same names as `Declaration`'s.
+
+    Relative files start at the folder of the factory's module.
+    """
+    describe = getattr(factory, "describe", None)
+    if describe is not None:
+        declared: Declaration = describe(settings)
+        files = declared.files
+    else:
+        given = getattr(factory, "files", {})
+        files = given if isinstance(given, Mapping) else {str(path): Path(path) for path in given}
+        attributes = ("trained", "note", "is_remote", "missing")
+        declared = Declaration(**{key: getattr(factory, key) for key in attributes if isinstance(getattr(factory, key, None), bool | str)})
+    return replace(declared, files={key: folder / path for key, path in files.items()})
+
+
+def _declares_nothing(kind: KindName, target: str) -> bool:
+    """Tell whether a factory need not be imported before it is used: shipped parts of some kinds have nothing to declare.
+
+    Those behind an address have: they are remote.
+    """
+    return kind in PLAIN_KINDS and any(target == shipped for name, (shipped, _) in BUILTIN[kind].items() if "://" not in name)
+
+
+def note_of(spec: PartSpec, declared: Declaration) -> str:
+    """Return what a part is in a few words, where it does not say so itself."""
+    trained = "" if declared.trained is None else "trained" if declared.trained else "untrained"
+    return declared.note or trained or ("no network" if spec.kind == "fixer" else "")
+
+
+def _described(spec: PartSpec, factory: Any) -> PartSpec:
+    module = file_of(spec.target)
+    modules = [] if module is None else [module]
+    if inspect.isclass(factory) or inspect.isfunction(factory):  # a package may only pass on what another module defines
+        home = getattr(sys.modules.get(factory.__module__), "__file__", None)
+        modules += [Path(home)] if home is not None and Path(home) not in modules else []
+    mode = installed(MODES).get(str(getattr(spec.settings, "loop_mode", "")))
+    if mode is not None:  # what calls a fixer of blocks shapes its frames, and no import leads there
+        modules += [file for file in [file_of(mode.value)] if file is not None]
+    for file in modules if factory is not None else ():
+        require_unedited(file, code_digest(file))
+    declared = declaration_of(factory, spec.settings, module.parent if module else Path())
+    shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}") for key, path in declared.files.items()}
+    attribute = spec.target.rpartition(":")[2]
+    return PartSpec(
+        spec.kind,
+        spec.name,
+        spec.target,
+        spec.settings,
+        None if declared.is_remote else part_digest(modules, attribute, spec.settings, shas),
+        note_of(spec, declared),
+        declared.trained,
+        {str(declared.files[key]): sha for key, sha in shas.items()},
+        dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},
+        str(getattr(factory, "controller", "bicycle")) if spec.kind == "policy" else "",
+        spec.address,
+        declared.missing,
+    )
+
+
+def _settings(kind: KindName, name: str, factory: Any, overrides: Sequence[str]) -> BaseModel | None:
+    """Return a part's validated settings: its defaults (for a fixer ``configs/fixers/NAME.yaml``) with the overrides on top."""
+    model: Any = getattr(factory, "settings_model", None)
+    if model is None and kind == "fixer":
+        model = load("alpasim_plugin.fixers.settings:FixerSettings", kind)
+    if model is None:
+        return None
+    if hasattr(model, "load"):
+        settings: BaseModel = model.load(name, overrides)
+        return settings
+    doing = f"reading the settings of a {kind}"
+    validated: BaseModel = validate(model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides, doing), doing)
+    return validated
+
+
+def _steps_to_front(front: str, base: str) -> tuple[str, str]:
+    """Move ``@STEPS`` from the end of a composite name to the fixer, which it belongs to."""
+    match = re.fullmatch(r"(.+)@([0-9]+)", base)
+    return (front, base) if match is None or "@" in front else (f"{front}@{match[2]}", match[1])
+
+
+def _in_the_loop(fixer: PartSpec) -> PartSpec:
+    """Refuse a fixer without weights, and one that needs frames which a closed loop has not rendered yet."""
+    doing, named = "choosing a renderer for a closed loop", f"fixer {fixer.name!r}"
+    settings: Any = fixer.settings
+    if getattr(settings, "is_offline", False):
+        ahead = settings.unit.lookahead_frames
+        found = f"its first frame needs {ahead} frames after it, which a closed loop has not driven yet"
+        do = f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}"
+        raise InputError(doing, named, found, do)
+    if fixer.missing:
+        raise InputError(doing, named, fixer.note, fixer.missing)
+    return fixer
+
+
+def _is_fixer(target: str) -> bool:
+    part = load(absolute_target(target), "renderer or fixer")
+    return hasattr(part, "step") and not hasattr(part, "render")
+
+
+def _require_fixer(name: str, front: str, is_composite: bool) -> None:
+    plain, steps = split_steps(front)
+    fixers, renderers = names("fixer"), names("renderer")
+    if plain in fixers:
+        return
+    if steps is not None and plain in renderers:
+        raise InputError(DOING, f"renderer {name!r}", f"{plain!r} has no step count", f"write {plain}, or FIXER@STEPS")
+    near = difflib.get_close_matches(plain, [*renderers, *fixers], n=1)
+    raise InputError(
+        DOING,
+        f"renderer {name!r}",
+        f"no {'fixer' if is_composite else 'renderer or fixer'} has the name {plain!r}",
+        (f"did you mean {near[0]!r}? " if near else "")
+        + "'simrun list renderers' and 'simrun list fixers' name them; together FIXER+RENDERER; your own as package.module:Class",
+    )

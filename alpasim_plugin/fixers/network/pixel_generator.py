@@ -1,0 +1,392 @@
+"""A causal generator in pixels, one frame at a time: a recurrent U-Net that predicts the clean frame from the render.
+
+    z_1 = m r + (1 - m) eps                          source (OneFixer, Eq. 1), m = 1 above half opacity
+    z_t = (1 - t) x_0 + t z_1                        interpolant; deployed at t = 1
+    x_0 = r + G(r, z_t - r, opacity, map, state)     prediction of the clean frame, from the render
+    v   = (z_t - x_0) / t                            velocity; the one step z_1 - v (Eq. 2) is x_0
+
+The state is what the generator itself made of the past: its last output, the render that this was made from, and recurrent channels at a
+quarter of the resolution. The network works at 1/4, 1/8 and 1/16; a detail path at 1/2 reads render, opacity and last output again and
+writes the result, so that fine texture does not pass through the U-Net. Every value of the noise in the source is a function of rollout,
+camera, frame, step and pixel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.random import fork_rng
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import derive_seed
+from alpasim_plugin.core.types import F32, I64, U8
+from alpasim_plugin.fixers.network.checkpoints import listed, weight
+from alpasim_plugin.fixers.network.pixel_layers import (
+    Conv3,
+    Dense,
+    Downsample,
+    FrameMemory,
+    MemoryState,
+    ResidualBlock,
+    Upsample,
+    activation,
+    cells,
+    pixels,
+    repeat_per_pixel,
+    small,
+)
+from alpasim_plugin.fixers.network.reference_blend import (
+    CELL,
+    DETAIL,
+    BesideCells,
+    BlendHeads,
+    ReferenceBlend,
+    Sources,
+    gather_beside,
+    mix,
+    sources_of,
+)
+
+HOLE = 0.5  # opacity below which noise enters the source
+ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Steele et al., 2014, SplitMix64)
+MIX = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
+LAST = np.uint64(31)
+CHANNELS = 3
+
+
+def hole_mask(opacity: Tensor) -> Tensor:
+    """Return the mask m of Eq. 1, hardened: 1 above half opacity, falling to 0 where nothing is drawn.
+
+    With m = opacity, noise would enter the half of a picture that is nearly opaque, and a small network would have to take it out again.
+    """
+    return (opacity / HOLE).clamp(max=1)
+
+
+def pixel_source(render: Tensor, opacity: Tensor, eps: Tensor) -> Tensor:
+    """Return z_1 = m r + (1 - m) eps (Eq. 1) for images ``(..., C)`` and an opacity of one channel."""
+    m = hole_mask(opacity)
+    return m * render + (1 - m) * eps
+
+
+def sparse_source(render: Tensor, opacity: Tensor, draw: Callable[[int, I64], F32]) -> Tensor:
+    """Return `pixel_source` with noise that is drawn only where it has weight.
+
+    Args:
+        render: ``(B, H, W, 3)``.
+        opacity: ``(B, H, W, 1)``.
+        draw: Called per image that has a hole with its place in the batch and row-major indices ``(N,)``; returns ``(N, 3)``.
+    """
+    source = render
+    for b, alpha in enumerate(opacity[..., 0].flatten(1)):
+        holes = (alpha < HOLE).nonzero()[:, 0]
+        if not len(holes):
+            continue
+        source = source.clone() if source is render else source
+        eps = torch.from_numpy(draw(b, holes.cpu().numpy().astype(np.int64))).to(render.device)
+        pixels = source[b].view(-1, render.shape[-1])
+        pixels[holes] = pixel_source(pixels[holes], alpha[holes, None], eps)
+    return source
+
+
+def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pixels: I64) -> F32:
+    """Draw standard normal values for some pixels of a frame; a pixel's values do not depend on which others are asked for.
+
+    Drawing whole frames would take longer than the network: holes are about one pixel in a hundred.
+
+    Args:
+        scene_id, seed, camera: Key of the stream.
+        draw: Flow step.
+        frame: Index in the rollout, or `content_key`.
+        pixels: ``(N,)`` row-major indices in the image.
+
+    Returns:
+        ``(N, 3)``.
+
+    Example:
+        >>> few, many = (pixel_noise("s", 0, "front", 0, 3, np.array(p)) for p in ([7], [5, 7]))
+        >>> bool((few[0] == many[1]).all())
+        True
+    """
+    key = np.uint64(derive_seed(scene_id, seed, f"fixer/{camera}/{draw}", frame))
+    index = (pixels[:, None] * CHANNELS + np.arange(CHANNELS)).astype(np.uint64) * np.uint64(2)
+    with np.errstate(over="ignore"):  # arithmetic modulo 2^64
+        u, v = (_uniform(key + (index + np.uint64(i + 1)) * ODD) for i in range(2))
+    normal: F32 = (np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)).astype(np.float32)  # Box and Muller, 1958
+    return normal
+
+
+def content_key(t_us: int, rgb: U8) -> int:
+    """Return a frame's number as its content gives it: the same render at the same time has the same noise in every rollout."""
+    return int.from_bytes(hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(), "little")
+
+
+def _uniform(x: np.ndarray) -> np.ndarray:
+    """Mix 64-bit counters into uniform values in (0, 1]."""
+    for shift, factor in MIX:
+        x = (x ^ (x >> shift)) * factor
+    x = x ^ (x >> LAST)
+    return ((x >> np.uint64(11)).astype(np.float64) + 1) * 2.0**-53
+
+
+GRID_PX = 16  # sides are multiples of it
+IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
+DETAIL_IMAGES = 7  # render 3, opacity 1, last output 3
+DOING = "building a generator in pixels"
+
+
+@dataclass(frozen=True)
+class PixelSizes:
+    """Sizes of the network.
+
+    Args:
+        widths: Channels at 1/4, 1/8 and 1/16.
+        blocks: Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4.
+        detail: Channels of the detail path at 1/2.
+        hidden: Recurrent channels at 1/4; 0: none.
+        memory: Past frames that are attended to at 1/16 (`nets.pixel_layers`); 0: none.
+        blend: Channels of the head that blends references with the picture (`nets.reference_blend`); 0: references are not read.
+    """
+
+    widths: tuple[int, int, int] = (48, 80, 160)
+    blocks: tuple[int, int, int, int, int] = (0, 1, 1, 1, 1)
+    detail: int = 16
+    hidden: int = 16
+    memory: int = 0
+    blend: int = 0
+
+
+class PixelState(NamedTuple):
+    """What the generator knows of the past."""
+
+    output: Tensor  # (B, H, W, 3) its last output, in [-1, 1]
+    render: Tensor  # (B, H, W, 3) what that was made from
+    hidden: Tensor  # (B, H / 4, W / 4, hidden) in (-1, 1)
+    kept: Tensor  # (B, memory, cells at 1/16, channels) keys and values of past frames
+    frames: Tensor  # (B, 1, 1, 1) how many came so far
+    recorded: Tensor  # (B, H, W, 1) share of the references in the last output, 0 to 1
+
+    def detached(self) -> PixelState:
+        """Return the same values, cut off from the graph that made them."""
+        return PixelState(*(part.detach() for part in self))
+
+    def restarted(self, fresh: Tensor, start: PixelState) -> PixelState:
+        """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
+        at = fresh[:, None, None, None]
+        return PixelState(*(torch.where(at, new, old) for new, old in zip(start, self, strict=True)))
+
+
+class BeforeBlend(NamedTuple):
+    """What the network made of a frame, before references are blended in."""
+
+    repaired: Tensor  # (B, H, W, 3) render plus change
+    hidden: Tensor  # as in `PixelState`, as are the next two
+    kept: Tensor
+    frames: Tensor
+    heads: BlendHeads | None  # None without references
+
+
+class GatheredCells(NamedTuple):
+    """What the network reads, as cells of pixels."""
+
+    coarse: Tensor  # (B, H / 4, W / 4, 16 * IMAGES + hidden)
+    fine: Tensor  # (B, H / 2, W / 2, 4 * DETAIL_IMAGES)
+
+
+def gather_cells(render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None) -> GatheredCells:
+    """Put what the network reads side by side; arguments as in `PixelGenerator.forward`, result in float32.
+
+    ``coarse`` holds per cell the `cells` of render, 2 opacity - 1, map, last output, last render and source minus render, then the
+    recurrent channels; ``fine`` those of render, 2 opacity - 1 and last output.
+    """
+    cover = 2 * opacity - 1
+    noise = torch.zeros_like(render) if source is None else source - render
+    images = render, cover, sdmap, state.output, state.render, noise
+    coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
+    fine = torch.cat([cells(image, DETAIL) for image in (render, cover, state.output)], dim=-1)
+    return GatheredCells(coarse, fine)
+
+
+class PixelGenerator(nn.Module):
+    """The network.
+
+    Args:
+        sizes: Widths and depths.
+
+    Example:
+        >>> net = PixelGenerator(PixelSizes((8, 8, 8)))
+        >>> r = torch.zeros(1, 32, 48, 3)
+        >>> out, state = net(r, r[..., :1] + 1, r, net.start(r))
+        >>> out.shape, state.hidden.shape
+        (torch.Size([1, 32, 48, 3]), torch.Size([1, 8, 12, 16]))
+    """
+
+    def __init__(self, sizes: PixelSizes = PixelSizes()) -> None:
+        super().__init__()
+        self.sizes = sizes
+        at4, at8, at16 = sizes.widths
+        depth = sizes.blocks
+        self.stem = Dense(CELL**2 * IMAGES + sizes.hidden, at4)
+        self.mix = Conv3(at4, at4)
+        self.encode4 = _blocks(at4, depth[0])
+        self.down8 = Downsample(at4, at8)
+        self.time = Dense(2, at8, bias=False)
+        self.encode8 = _blocks(at8, depth[1])
+        self.down16 = Downsample(at8, at16)
+        self.middle = _blocks(at16, depth[2])
+        self.memory = FrameMemory(at16, sizes.memory) if sizes.memory else None
+        self.up8 = Upsample(at16, at8)
+        self.decode8 = _blocks(at8, depth[3])
+        self.up4 = Upsample(at8, at4)
+        self.decode4 = _blocks(at4, depth[4])
+        self.remember = Dense(at4, sizes.hidden) if sizes.hidden else None
+        self.up2 = Upsample(at4, sizes.detail)
+        self.read = Dense(DETAIL**2 * DETAIL_IMAGES, sizes.detail)
+        self.refine = Conv3(sizes.detail, sizes.detail)
+        self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
+        repeat_per_pixel(self.write, DETAIL)
+        self.blend = ReferenceBlend(at4, sizes.detail, sizes.blend) if sizes.blend else None
+        nn.init.zeros_(self.time.weight)
+
+    @classmethod
+    def random(cls, sizes: PixelSizes, seed: int) -> Self:
+        """Return an untrained network: its weights are a function of the seed, and torch's own random state stays as it was."""
+        with fork_rng(devices=[]):
+            torch.manual_seed(seed % 2**63)
+            return cls(sizes)
+
+    def start(self, render: Tensor) -> PixelState:
+        """Return the state before a rollout: the first render stands for the past.
+
+        Args:
+            render: ``(B, H, W, 3)`` the first frame.
+        """
+        b, h, w, _ = render.shape
+        hidden = render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden)
+        at16 = (h // GRID_PX) * (w // GRID_PX)
+        empty = MemoryState(render.new_zeros(b, 0, at16, 0), render.new_zeros(b, 1, 1, 1))
+        memory = empty if self.memory is None else self.memory.start(render, at16)
+        return PixelState(render, render, hidden, *memory, render.new_zeros(b, h, w, 1))
+
+    def forward(
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        state: PixelState,
+        source: Tensor | None = None,
+        t: Tensor | None = None,
+        references: Tensor | None = None,
+    ) -> tuple[Tensor, PixelState]:
+        """Predict the clean frame.
+
+        Args:
+            render: ``(B, H, W, 3)`` in [-1, 1]; sides are multiples of 16.
+            opacity: ``(B, H, W, 1)``, 0 to 1.
+            sdmap: ``(B, H, W, 3)`` in [-1, 1]; black (-1) where there is no map.
+            state: From `start` or the last call.
+            source: ``(B, H, W, 3)`` z_t; None is the render, which is z_1 where nothing is transparent.
+            t: ``(B,)`` flow time; None is 1, the deployed step.
+            references: ``(B, K, H, W, 4)`` recorded frames in this view, colour in [-1, 1] and where it holds, 0 to 1; None: there is none.
+                A network without a blending head does not read them.
+
+        Returns:
+            ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
+        """
+        out, after, _ = self.with_sources(render, opacity, sdmap, state, source, t, references)
+        return out, after
+
+    def with_sources(
+        self,
+        render: Tensor,
+        opacity: Tensor,
+        sdmap: Tensor,
+        state: PixelState,
+        source: Tensor | None = None,
+        t: Tensor | None = None,
+        references: Tensor | None = None,
+    ) -> tuple[Tensor, PixelState, Sources | None]:
+        """Predict the clean frame and say what it was blended of; None without references. See `forward`."""
+        gathered = gather_cells(render, opacity, sdmap, state, source)
+        beside = None if self.blend is None or references is None else gather_beside(references, render)
+        made = self.before_blend(gathered, render, state, t, beside)
+        out, recorded, sources = made.repaired, torch.zeros_like(render[..., :1]), None
+        if made.heads is not None and references is not None:
+            sources = sources_of(made.repaired, references, made.heads)
+            out, recorded = mix(sources)
+        return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded), sources
+
+    def before_blend(
+        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, beside: BesideCells | None = None
+    ) -> BeforeBlend:
+        """Run the network up to the blend of its picture with the references, which `gather_beside` gathered; see `forward`."""
+        dtype = self.stem.weight.dtype
+        stem, read = self.stem(gathered.coarse.to(dtype)), self.read(gathered.fine.to(dtype))
+        if self.blend is not None and beside is not None:
+            at4, at2 = self.blend.features(beside)
+            stem, read = stem + at4, read + at2
+        x4 = self.encode4(self.mix(activation(stem, inplace=True)))
+        x8 = self.down8(activation(x4))
+        if t is not None:
+            x8 = x8 + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
+        x8 = self.encode8(x8)
+        y = self.middle(self.down16(activation(x8)))
+        kept, frames = state.kept, state.frames
+        if self.memory is not None:
+            y, (kept, frames) = self.memory(y, MemoryState(kept, frames))
+        y = self.decode8(self.up8(y).add_(x8))
+        y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
+        hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
+        fine = activation(read.add_(self.up2(y)), inplace=True)
+        fine = self.refine(fine, activated=True)
+        heads = self.blend(y, fine, beside) if self.blend is not None and beside is not None else None
+        return BeforeBlend(pixels(self.write(fine), DETAIL).float() + render, hidden, kept, frames, heads)
+
+    @classmethod
+    def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
+        """Build the network that a state dict fits; sizes are read off the tensors.
+
+        Raises:
+            InputError: Tensors that are missing, unknown, of another shape or not finite.
+        """
+        net = cls(_sizes_of(tensors, source))
+        mine = net.state_dict()
+        missing, unknown = sorted(mine.keys() - tensors.keys()), sorted(tensors.keys() - mine.keys())
+        wrong = [f"{key} {list(tensors[key].shape)} for {list(mine[key].shape)}" for key in mine.keys() & tensors.keys()
+                 if tensors[key].shape != mine[key].shape]  # fmt: skip
+        found = "; ".join(filter(None, (listed("missing", missing), listed("unknown", unknown), listed("shape", sorted(wrong)))))
+        if found:
+            raise InputError(DOING, source, found, "give the weights of one generator in pixels, all of them")
+        net.load_state_dict({key: weight(key, value, torch.float32, source) for key, value in tensors.items()})
+        return net
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Sizes as plain values."""
+        return asdict(self.sizes)
+
+
+def _blocks(channels: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*(ResidualBlock(channels) for _ in range(count)))
+
+
+def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
+    def width(key: str) -> int:
+        if key not in tensors or tensors[key].ndim < 2:
+            raise InputError(DOING, source, f"no kernel {key}", "give the weights of a generator in pixels")
+        return int(tensors[key].shape[0])
+
+    def depth(stage: str) -> int:
+        return len({key.split(".")[1] for key in tensors if key.startswith(f"{stage}.")})
+
+    hidden = width("remember.weight") if "remember.weight" in tensors else 0
+    widths = (width("stem.weight"), width("down8.weight"), width("down16.weight"))
+    blocks = (depth("encode4"), depth("encode8"), depth("middle"), depth("decode8"), depth("decode4"))
+    memory = width("memory.age") if "memory.age" in tensors else 0
+    blend = width("blend.head.weight") if "blend.head.weight" in tensors else 0
+    return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory, blend)

@@ -1,0 +1,213 @@
+"""What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
+
+    s_k       = act(y + C_k)                                        C_k: what reference k shows beside the render, at 1/4; y: the U-Net
+    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are
+                                                                    (cost volume; Sun et al., 2018, PWC-Net, Sec. 3)
+    a_k       = A (s_k, m_k)
+    f_k       = act(H (fine + E_k + U a_k))                         E_k: the same at 1/2; fine: the detail path
+    w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
+    o_k       = 8 px tanh (D a_k + d)                               a misplaced reference is seen at 1/4, its edges at 1/2
+    x_k       = ref_k(p + o_k) + c                                  the reference, moved by a learned offset
+    p_0..p_K  = softmax(0, w_k + log v_k(p + o_k))                  v_k: where reference k holds
+    x         = p_0 (render + residual) + sum_k p_k x_k
+
+All references share one set of weights, so their number and order are free; without any, p_0 is 1 and the generator is the one without
+references. A warp that is wrong costs nothing where the network gives it no weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.fixers.network.pixel_layers import Conv3, Dense, Upsample, activation, cells, pixels
+
+CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
+CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
+OFFSET_PX = 8.0  # largest learned offset
+NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
+MATCH_CELLS, MATCH_CHANNELS = 2, 16  # how far a reference is compared with the picture, in cells; of the features compared
+DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
+
+
+class BesideCells(NamedTuple):
+    """What references show beside the render, ``(ref - render) v`` and ``v``, as `cells`; float32."""
+
+    mean4: Tensor  # (B, H / 4, W / 4, 64) the mean over the references
+    mean2: Tensor  # (B, H / 2, W / 2, 16)
+    each4: Tensor  # (B K, H / 4, W / 4, 64)
+    each2: Tensor  # (B K, H / 2, W / 2, 16)
+
+
+class BlendHeads(NamedTuple):
+    """How references enter the picture, at half its resolution; offsets in float32."""
+
+    weight: Tensor  # (B, K, H / 2, W / 2, 4) logarithm of each pixel's weight over that of the repaired render, `cells` of one channel
+    offset_px: Tensor  # (B, K, H / 2, W / 2, 2) x and y of where it is looked up
+    correction: Tensor  # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
+
+
+class ReferenceBlend(nn.Module):
+    """Read references; `mix` then blends them with the generator's own picture.
+
+    Args:
+        coarse: Channels of the generator at 1/4.
+        detail: Channels of its detail path.
+        width: Channels of the blending head.
+    """
+
+    def __init__(self, coarse: int, detail: int, width: int) -> None:
+        super().__init__()
+        self.stem = Dense(CELL**2 * CHANNELS, coarse, bias=False)
+        self.read = Dense(DETAIL**2 * CHANNELS, detail, bias=False)
+        self.coarse = Dense(CELL**2 * CHANNELS, coarse)
+        self.sought = Dense(coarse, MATCH_CHANNELS, bias=False)
+        self.shown = Conv3(coarse, MATCH_CHANNELS)
+        self.match = Dense((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
+        self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
+        self.shift = Dense(width, 2)
+        self.up = Upsample(width, detail)
+        self.own = Dense(DETAIL**2 * CHANNELS, detail)
+        self.head = Conv3(detail, width)
+        self.write = Dense(width, DETAIL**2 + 2 + DETAIL**2 * 3)
+        # Where no gradient is asked for, faster ones may stand here.
+        self.likeness: Callable[[Tensor, Tensor], Tensor] = likeness
+        self.offsets: Callable[[Tensor, Tensor], Tensor] = offsets
+        for layer in (self.stem, self.read, self.match, self.shift, self.up, self.write):
+            nn.init.zeros_(layer.weight)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        assert self.write.bias is not None
+        with torch.no_grad():
+            self.write.bias[: DETAIL**2] = DOUBT
+
+    def features(self, beside: BesideCells) -> tuple[Tensor, Tensor]:
+        """Return what the references add to the first layers: ``(B, H / 4, W / 4, coarse)`` and ``(B, H / 2, W / 2, detail)``."""
+        dtype = self.stem.weight.dtype
+        return self.stem(beside.mean4.to(dtype)), self.read(beside.mean2.to(dtype))
+
+    def forward(self, y: Tensor, fine: Tensor, beside: BesideCells) -> BlendHeads:
+        """Say how every reference enters the picture.
+
+        Args:
+            y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
+            fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
+            beside: What the references show beside the render.
+        """
+        b = y.shape[0]
+        k = beside.each4.shape[0] // b
+        side = activation(_added(self.coarse(beside.each4.to(y.dtype)), y), inplace=True)
+        alike = self.likeness(self.sought(y), self.shown(side))
+        at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
+        at4 = self.align[1](at4, activated=True)
+        joined = _added(self.own(beside.each2.to(fine.dtype)).add_(self.up(at4)), fine)
+        said = self.write(self.head(activation(joined, inplace=True), activated=True))
+        weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
+        return BlendHeads(weight, self.offsets(offset.flatten(0, 1), self.shift(at4)).view(offset.shape), correction)
+
+
+def likeness(sought: Tensor, shown: Tensor) -> Tensor:
+    """Compare features with those of the cells around, the mean of products over channels.
+
+    Args:
+        sought: ``(B, h, w, C)``.
+        shown: ``(B K, h, w, C)`` K references of each; beyond the border nothing is alike.
+
+    Returns:
+        ``(B K, h, w, (2 MATCH_CELLS + 1)^2)`` by row and column of the other cell.
+    """
+    h, w = sought.shape[1:3]
+    reach = 2 * MATCH_CELLS + 1
+    around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
+    each = sought[:, None].expand(-1, len(shown) // len(sought), -1, -1, -1).flatten(0, 1)
+    mean = sought.new_full((sought.shape[-1], 1), 1 / sought.shape[-1])  # as a product: a sum over few channels is slow on a CPU
+    return torch.cat([(each * around[:, i : i + h, j : j + w]) @ mean for i in range(reach) for j in range(reach)], dim=-1)
+
+
+def offsets(at2: Tensor, at4: Tensor) -> Tensor:
+    """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are said at half the resolution and, coarser, at a quarter of it."""
+    finer = F.interpolate(at4.float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+    return torch.tanh(at2.float() + finer.permute(0, 2, 3, 1)) * OFFSET_PX
+
+
+class Sources(NamedTuple):
+    """What a picture is blended of: the generator's own, then each reference."""
+
+    colour: Tensor  # (B, 1 + K, H, W, 3)
+    logit: Tensor  # (B, 1 + K, H, W, 1) their softmax over the sources is the blend
+    holds: Tensor  # (B, 1 + K, H, W, 1) where each holds, above 0 to 1
+
+
+def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1) -> Sources:
+    """Return what the picture is blended of.
+
+    Args:
+        repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
+        references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
+        heads: Of the same, or of pictures ``scale`` times smaller; what they say is then interpolated, and offsets are as much longer.
+        scale: How many times.
+    """
+    b, k, h, w, _ = references.shape
+    weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
+    weight, correction = (enlarged(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction))
+    moved = _sampled(references.flatten(0, 1), scale * offset_px)
+    colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
+    holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
+    logit = (weight + holds.log()).view(b, k, h, w, 1)
+    own = torch.zeros_like(logit[:, :1])
+    return Sources(
+        torch.cat([repaired[:, None], colour], dim=1),
+        torch.cat([own, logit], dim=1),
+        torch.cat([own + 1, holds.view(b, k, h, w, 1)], dim=1),
+    )
+
+
+def enlarged(x: Tensor, scale: int) -> Tensor:
+    """Enlarge pictures ``(B, H, W, C)`` bilinearly, a whole number of times."""
+    if scale == 1:
+        return x
+    return F.interpolate(x.permute(0, 3, 1, 2), scale_factor=scale, mode="bilinear", align_corners=False).permute(0, 2, 3, 1)
+
+
+def mix(sources: Sources) -> tuple[Tensor, Tensor]:
+    """Blend the sources of a picture.
+
+    Returns:
+        ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
+    """
+    shares = sources.logit.softmax(dim=1)
+    return (shares * sources.colour).sum(dim=1), 1 - shares[:, 0]
+
+
+def gather_beside(references: Tensor, render: Tensor) -> BesideCells:
+    """Put what the network reads of references side by side.
+
+    Args:
+        references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds v, 0 to 1.
+        render: ``(B, H, W, 3)`` in [-1, 1].
+    """
+    holds = references[..., 3:]
+    each = torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
+    mean, flat = each.mean(dim=1), each.flatten(0, 1)
+    return BesideCells(cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL))
+
+
+def _added(each: Tensor, one: Tensor) -> Tensor:
+    """Add an image ``(B, ...)`` to each of K: ``(B K, ...)``, in place."""
+    parts = each.view(one.shape[0], -1, *one.shape[1:])
+    return parts.add_(one[:, None]).flatten(0, 1)
+
+
+def _sampled(images: Tensor, offset: Tensor) -> Tensor:
+    """Look images ``(N, H, W, 4)`` up at offsets in their pixels, x and y, of a coarser grid; beyond the border the outermost go on."""
+    h, w = images.shape[1:3]
+    full = F.interpolate(offset.permute(0, 3, 1, 2), size=(h, w), mode="bilinear", align_corners=False)
+    columns = torch.arange(w, device=images.device) + 0.5
+    rows = torch.arange(h, device=images.device)[:, None] + 0.5
+    grid = torch.stack([(columns + full[:, 0]) * (2 / w) - 1, (rows + full[:, 1]) * (2 / h) - 1], dim=-1)
+    sampled = F.grid_sample(images.permute(0, 3, 1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled.permute(0, 2, 3, 1)

@@ -1,1 +1,0 @@
-"""Reading with limits, atomic writes, checksums, locks, the cache, configuration with positions."""

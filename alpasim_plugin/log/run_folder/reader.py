@@ -1,0 +1,259 @@
+"""Read a run folder into plain records; nothing here renders, scores or writes.
+
+It works on a folder that was copied from another machine, without scenario files or weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+from urllib.parse import quote
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as pads
+
+from alpasim_plugin.core.reading import parsing, read_json_as, read_json_object
+from alpasim_plugin.log.run_folder.check import planned_cells
+from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
+from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
+from alpasim_plugin.log.run_folder.schema import (
+    AGAIN,
+    CONTENTS,
+    DOING,
+    KEYS,
+    MANIFEST,
+    ROLLOUTS,
+    ROLLOUTS_TABLE,
+    RUN_INFO,
+    SCENES,
+    STEPS,
+    STEPS_NAME,
+    STEPS_TABLE,
+    SUMMARY,
+    metrics_in,
+)
+from alpasim_plugin.log.run_folder.shapes import RunInfo, SceneFile, Summary
+from alpasim_plugin.log.run_folder.writer import rollout_table
+
+STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
+TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder; rollouts, steps and scenes are read on demand.
+
+    Attributes:
+        info: ``run.json``.
+        summary: ``summary.json``; empty where the run is not finished.
+        rollouts: Rows of ``rollouts.parquet``.
+        metric_names: Rollout metrics in the column order of ``rollouts.parquet``.
+    """
+
+    folder: Path
+    info: Mapping[str, Any]
+    summary: Mapping[str, Any]
+    rollouts: Sequence[Rollout]
+    metric_names: tuple[str, ...]
+
+    @property
+    def renderers(self) -> list[str]:
+        """List renderers in the order of the command."""
+        return self._in_order("renderers", (r.renderer for r in self.rollouts))
+
+    @property
+    def policies(self) -> list[str]:
+        """List policies in the order of the command."""
+        return self._in_order("policies", (r.policy for r in self.rollouts))
+
+    @property
+    def scenes(self) -> list[str]:
+        """List scene ids in the order of ``run.json``."""
+        return self._in_order("scenes", (r.scene for r in self.rollouts))
+
+    def _in_order(self, axis: str, seen: Iterable[str]) -> list[str]:
+        return list(dict.fromkeys([*(self.info.get(axis) or ()), *seen]))
+
+    @property
+    def scenes_asked(self) -> list[str]:
+        """List what the command named as scenarios, or, where no command did, paths that one may name."""
+        refs = [scene.get("ref") or {} for scene in (self.info.get("scenes") or {}).values()]
+        return self.info.get("asked") or list(dict.fromkeys(str(ref["path"]) for ref in refs if ref.get("path")))
+
+    @property
+    def variants(self) -> list[str]:
+        """List the columns of the result tables: the keys under which ``summary.json`` holds metrics."""
+        return list(self.summary.get("metrics") or {}) or self.renderers
+
+    def rollouts_of(self, variant: str) -> list[Rollout]:
+        """List the rollouts of a summary key: a renderer's name, or `Rollout.variant`."""
+        return [r for r in self.rollouts if r.variant == variant] or [r for r in self.rollouts if r.renderer == variant]
+
+    @cached_property
+    def by_scene(self) -> Mapping[str, Sequence[Rollout]]:
+        """Give the rollouts of each scene."""
+        found: dict[str, list[Rollout]] = {}
+        for rollout in self.rollouts:
+            found.setdefault(rollout.scene, []).append(rollout)
+        return found
+
+    @cached_property
+    def _scene_files(self) -> dict[str, Path]:
+        found: dict[str, Path] = {}
+        for path in sorted((self.folder / SCENES).rglob("*.json")):
+            scene_id = read_json(path).get("scene_id")
+            if isinstance(scene_id, str):
+                found[scene_id] = path
+        return found
+
+    def scene_path(self, scene: str) -> Path | None:
+        """Find the file of a scene's map, independent of how slashes in its name were encoded; None where there is none."""
+        return self._scene_files.get(scene)
+
+    def scene_data(self, scene: str) -> Mapping[str, Any] | None:
+        """Read a scene's map and logged drive; None where the run has no such file."""
+        path = self.scene_path(scene)
+        return None if path is None else read_json_as(SceneFile, path, DOING, do_this=AGAIN)
+
+    def manifest(self, rollout: Rollout) -> Mapping[str, Any]:
+        """Read a rollout's manifest; empty where the rollout did not get so far."""
+        path = self.file_of(rollout, MANIFEST)
+        return {} if path is None else read_json(path)
+
+    def file_of(self, rollout: Rollout, name: str) -> Path | None:
+        """Find a file in a rollout's folder; None where absent or where the path leaves the run folder."""
+        path = self._inside(rollout, name)
+        return path if path is not None and path.is_file() else None
+
+    def href(self, rollout: Rollout, name: str = "") -> str | None:
+        """Give a relative link to a rollout's folder or to a file in it; None where it does not exist."""
+        path = self._inside(rollout, name)
+        return None if path is None else quote(path.relative_to(self.folder).as_posix()) + ("" if name else "/")
+
+    def _inside(self, rollout: Rollout, name: str) -> Path | None:
+        path = self.folder / rollout.path / name
+        return path if rollout.path and path.exists() and path.resolve().is_relative_to(self.folder.resolve()) else None
+
+    def steps(self, metrics: Sequence[str], scenes: Sequence[str] | None = None) -> pa.Table:
+        """Read the named series from ``steps.parquet``.
+
+        Returns:
+            A table with renderer, policy, scene, seed, t_us, metric, value and valid; empty without the file.
+        """
+        keep = pc.field("metric").isin(list(metrics))
+        if scenes is not None:
+            keep = keep & pc.field("scene").isin(list(scenes))
+        return self._read_steps(self.folder / STEPS, STEP_COLUMNS, keep)
+
+    def steps_of(self, rollout: Rollout) -> pa.Table:
+        """Read all series of one rollout, from the table in its own folder or else from the run's.
+
+        Returns:
+            A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason; empty where neither exists.
+        """
+        own = self.file_of(rollout, STEPS_NAME)
+        keep = None
+        for name, value in zip(KEYS, rollout.cell, strict=True) if own is None else ():
+            keep = pc.field(name) == value if keep is None else keep & (pc.field(name) == value)
+        return self._read_steps(own or self.folder / STEPS, (*STEP_COLUMNS, "reason"), keep)
+
+    def _read_steps(self, path: Path, columns: Sequence[str], keep: pc.Expression | None, coded: bool = True) -> pa.Table:
+        if not path.is_file():
+            return STEPS_TABLE.arrow().empty_table().select(list(columns))
+        if path not in self._steps_checked:
+            STEPS_TABLE.check(path)
+            self._steps_checked.add(path)
+        with parsing(DOING, path, AGAIN, "no readable parquet"):
+            return pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(columns=list(columns), filter=keep)
+
+    @cached_property
+    def _steps_checked(self) -> set[Path]:
+        return set()
+
+    @cached_property
+    def invalid_reasons(self) -> dict[tuple[str, str], str]:
+        """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason, from the ledger or else the steps."""
+        columns = ["renderer", "metric", "reason"]
+        table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
+        counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
+        rows = counts.to_pylist()  # ascending: the most frequent reason is written last
+        found = {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
+        for renderer, ledger in (self.summary.get("censoring") or {}).items():
+            for metric, entry in (ledger.get("invalid") or {}).items():
+                reasons = entry.get("reasons") or {}
+                if reasons:
+                    found[renderer, metric] = max(reasons, key=lambda reason: reasons[reason])
+        return found
+
+
+RunT = TypeVar("RunT", bound=Run)
+
+
+@dataclass(frozen=True)
+class RunSoFar(Generic[RunT]):
+    """A run as far as it has got.
+
+    Attributes:
+        run: With the finished rollouts alone; an unfinished one has no summary.
+        planned: Rollouts in all.
+        damage: What cannot be read, one line each.
+        finished: All of it is written, tables and reports too.
+    """
+
+    run: RunT
+    planned: int
+    damage: tuple[str, ...]
+    finished: bool
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object of a run folder.
+
+    Raises:
+        InputError: Absent, not JSON, or not an object.
+    """
+    return read_json_object(path, DOING, do_this=AGAIN)
+
+
+def reporting(run: Run) -> AbstractContextManager[None]:
+    """Give what makes a report of a run that says something impossible an error of that run, and not a traceback."""
+    return parsing("writing a report", run.folder, AGAIN, "a run from which no report can be made")
+
+
+def read_run(run_dir: Path | str) -> Run:
+    """Read a run folder.
+
+    Args:
+        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json`` (docs/architecture.md).
+
+    Raises:
+        InputError: A file is absent or unreadable, or ``rollouts.parquet`` is not as `ROLLOUTS_TABLE` says.
+    """
+    folder = Path(run_dir)
+    info: Mapping[str, Any] = read_json_as(RunInfo, folder / RUN_INFO, DOING, do_this=AGAIN)
+    summary: Mapping[str, Any] = read_json_as(Summary, folder / SUMMARY, DOING, do_this=AGAIN)
+    path = folder / ROLLOUTS
+    return Run(folder, info, summary, StoredRollouts(path), metrics_in(ROLLOUTS_TABLE.check(path)))
+
+
+def read_so_far(root: Path) -> RunSoFar[Run]:
+    """Read a run folder that may still be written: a manifest is written last, so a rollout that has one is whole.
+
+    Raises:
+        InputError: It holds no run, or its description or its tables are damaged.
+    """
+    if (root / CONTENTS).exists():
+        run = read_run(root)
+        return RunSoFar(run, len(run.rollouts), (), True)
+    info = read_run_json(root)
+    cells = planned_cells(info)
+    states = [inspect_rollout(root, cell) for cell in cells]
+    with parsing(DOING, root, AGAIN, "manifests from which no table can be made"):
+        table = rollout_table([state.manifest for state in states if state.manifest is not None and not state.damage])
+    damage = tuple(str(one) for state in states for one in state.damage)
+    return RunSoFar(Run(root, info, {}, rollouts_of_table(table), metrics_in(table.column_names)), len(cells), damage, False)

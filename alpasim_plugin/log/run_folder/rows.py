@@ -1,0 +1,147 @@
+"""Rows of a run folder's tables as plain records: rollouts, and the series of their metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, cell_name, metrics_in
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One row of ``rollouts.parquet``.
+
+    Attributes:
+        metrics: Rollout values; None where the metric is invalid or was not computed.
+        path: Folder of the rollout relative to the run folder, POSIX separators.
+    """
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+    status: str
+    failure_class: str = ""
+    failure: str = ""
+    path: str = ""
+    wall_s: float | None = None
+    frames: int | None = None
+    steps: int | None = None
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Return whether the rollout ran to its end."""
+        return self.status == "ok"
+
+    @property
+    def cell(self) -> tuple[str, str, str, int]:
+        """Give the key renderer, policy, scene, seed."""
+        return (self.renderer, self.policy, self.scene, self.seed)
+
+    def flag(self, *names: str) -> bool:
+        """Return whether any of the named 0/1 metrics is 1."""
+        return any((self.metrics.get(name) or 0.0) >= 0.5 for name in names)
+
+    @property
+    def variant(self) -> str:
+        """Give ``RENDERER/POLICY``, its key in ``summary.json`` of a run of several policies; of one policy that is the renderer alone."""
+        return cell_name(self.renderer, self.policy)
+
+
+class StoredRollouts(Sequence[Rollout]):
+    """The rows of ``rollouts.parquet``, read when the first one is asked for: what only needs columns never makes them.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @cached_property
+    def _rows(self) -> tuple[Rollout, ...]:
+        return rollouts_of_table(ROLLOUTS_TABLE.read(self._path))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Rollout: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Rollout, ...]: ...
+    def __getitem__(self, index: int | slice) -> Rollout | tuple[Rollout, ...]:
+        return self._rows[index]
+
+    def __iter__(self) -> Iterator[Rollout]:
+        return iter(self._rows)
+
+
+def rollouts_of_table(table: pa.Table) -> tuple[Rollout, ...]:
+    """Return the rollouts of a table with the columns of ``rollouts.parquet``."""
+    names = metrics_in(table.column_names)
+    rows = []
+    for row in table.to_pylist():
+        facts = {key: row[key] for key in (*KEYS, "status")}
+        facts |= {key: row.get(key) for key in ("frames", "steps")}
+        facts |= {key: row.get(key) or "" for key in ("failure_class", "failure")}
+        metrics = {name: _number(row[name]) if row[name + VALID] else None for name in names}
+        path = (row.get("path") or "").strip("/")
+        rows.append(Rollout(**facts, path=path, wall_s=_number(row.get("wall_s")), metrics=metrics))
+    return tuple(rows)
+
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+Own = dict[str, tuple[I64, F64]]  # metric -> (t_us (T,), value (T,)) of one rollout
+Series = dict[tuple[str, str, str, int], Own]
+
+
+def series_by_cell(table: pa.Table) -> Series:
+    """Split a step table into valid, finite, time-sorted series.
+
+    Works on integer codes of the text columns: a run has millions of steps and few names.
+
+    Returns:
+        cell -> metric -> (``t_us (T,)``, ``value (T,)``).
+    """
+    table = table.filter(pc.and_(table["valid"], pc.is_finite(table["value"]))) if table.num_rows else table
+    if not table.num_rows:
+        return {}
+    codes, names = zip(*(_coded(table[name]) for name in (*KEYS, "metric")), strict=True)
+    t_us = table["t_us"].to_numpy().astype(np.int64, copy=False)
+    value = table["value"].to_numpy().astype(np.float64, copy=False)
+    group = np.zeros(len(t_us), np.int64)
+    for code, values in zip(codes, names, strict=True):
+        group = group * len(values) + code
+    order = np.lexsort((t_us, group))
+    group, t_us, value = group[order], t_us[order], value[order]
+    starts = np.flatnonzero(np.diff(group, prepend=-1))
+    stops = np.append(starts[1:], len(group))
+    found: Series = {}
+    for start, stop in zip(starts, stops, strict=True):
+        row = order[start]
+        renderer, policy, scene, seed, metric = (values[code[row]] for code, values in zip(codes, names, strict=True))
+        found.setdefault((renderer, policy, scene, int(seed)), {})[metric] = (t_us[start:stop], value[start:stop])
+    return found
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[I64, list[Any]]:
+    """Return per row the index into the list of distinct values, and that list."""
+    coded = column.combine_chunks()
+    if isinstance(coded, pa.ChunkedArray):  # several chunks too large for one
+        coded = pa.concat_arrays(coded.chunks)
+    if not pa.types.is_dictionary(coded.type):
+        coded = coded.dictionary_encode()
+    return coded.indices.to_numpy(zero_copy_only=False).astype(np.int64, copy=False), coded.dictionary.to_pylist()

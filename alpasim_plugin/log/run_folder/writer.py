@@ -1,0 +1,244 @@
+"""Write a run folder: be its only writer, remove what killed writers left, write scenes, and tables from the rollouts' manifests."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.lock import one_writer
+from alpasim_plugin.core.processes import is_running
+from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
+from alpasim_plugin.log.run_folder.schema import KEYS, LOCK, ROLLOUTS, ROLLOUTS_TABLE, SCENES, STEPS, STEPS_NAME, STEPS_TABLE, VALID, slug
+
+ACTOR_STEP_US = 250_000
+GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
+CHUNK_ROWS = 4096  # rows that are held as dictionaries, which take ten times the memory
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp")  # as `alpasim_plugin.core.atomic.temporary_path` makes them
+
+
+@contextmanager
+def writing(root: Path, wait: bool = False, waiting: Callable[[str], None] = print) -> Iterator[None]:
+    """Be the only writer of a run folder during the block; left-overs of killed writers are removed first.
+
+    Args:
+        root: The run folder; made if it does not exist.
+        wait: Wait for another writer; otherwise refuse.
+        waiting: Called once with a line that says who is waited for.
+
+    Raises:
+        InfrastructureError: Another process writes the folder, or it is read-only.
+    """
+    with one_writer(root / LOCK, "writing a run folder", f"folder {root}", wait, waiting) as held:
+        remove_left_overs(root, held.since_ns)
+        yield
+
+
+def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
+    """Remove temporary files and folders of processes that are gone; return them.
+
+    Only names that simrun gives are touched, only those older than the lock, and only if no process of this machine has the number in the
+    name. Run folders inside this one (forks) have writers of their own and are left alone.
+
+    Args:
+        root: A run folder whose lock is held, or a folder that only this machine's processes write.
+        before_ns: When the lock was taken, by the clock of the file system; None: of any time.
+    """
+    removed = []
+    for at, folders, files in os.walk(root):
+        here = Path(at)
+        if here != root and LOCK in files:
+            folders.clear()
+            continue
+        for name in [*files, *folders]:
+            matched = _TEMPORARY.fullmatch(name)
+            if matched is None or is_running(int(matched[1])):
+                continue
+            path = here / name
+            if before_ns is not None and path.lstat().st_mtime_ns >= before_ns:
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+                folders.remove(name)
+            else:
+                path.unlink()
+            removed.append(path)
+    return removed
+
+
+def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return one flat row per rollout: its key, its status, and every metric with its validity.
+
+    An infinite value, for which JSON has no number, is the text "inf" or "-inf" in a manifest, and a number here.
+    """
+    rows = []
+    for manifest in manifests:
+        error = manifest.get("error") or {}
+        row: dict[str, Any] = {
+            **{key: manifest[key] for key in (*KEYS, "status", "path", "wall_s")},
+            **{key: manifest.get(key) for key in ("rollout", "frames", "steps")},
+            "failure_class": error.get("failure_class"),
+            "failure": error.get("found"),
+        }
+        for name, entry in manifest.get("metrics", {}).items():
+            row[name] = None if entry["value"] is None else float(entry["value"])
+            row[name + VALID] = entry["valid"]
+        rows.append(row)
+    return rows
+
+
+def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
+    """Return the content of ``rollouts.parquet``, a row per manifest."""
+    metrics = dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {}))
+    schema = ROLLOUTS_TABLE.arrow(metrics, any("rollout" in manifest for manifest in manifests))
+    starts = range(0, len(manifests), CHUNK_ROWS)
+    batches = [pa.RecordBatch.from_pylist(rollout_rows(manifests[start : start + CHUNK_ROWS]), schema) for start in starts]
+    return pa.Table.from_batches(batches, schema)
+
+
+def write_tables(root: Path, manifests: Sequence[dict[str, Any]]) -> pa.Table:
+    """Write ``rollouts.parquet`` and ``steps.parquet`` of a run folder and return the first.
+
+    Args:
+        root: The run folder; the manifests' rollouts are below it.
+        manifests: One per rollout, in the order of the tables.
+
+    Raises:
+        InfrastructureError: The disk refuses.
+    """
+    rollouts = rollout_table(manifests)
+    write_parquet(root / ROLLOUTS, rollouts)
+    parts = (root / m["path"] / STEPS_NAME for m in manifests if m["status"] == "ok")
+    _join_parquet(root / STEPS, STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names), parts)
+    return rollouts
+
+
+def write_steps(folder: Path, rows: Sequence[Mapping[str, Any]], of_logs: bool = False) -> None:
+    """Write ``steps.parquet`` of a rollout's folder; ``of_logs`` as for `TableSchema.arrow`."""
+    write_table(folder / STEPS_NAME, rows, STEPS_TABLE.arrow(of_logs=of_logs))
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
+    """Write rows as parquet atomically, in the order given."""
+    columns = {field.name: pa.array([row.get(field.name) for row in rows], type=field.type) for field in schema}
+    write_parquet(path, pa.table(columns, schema=schema))
+
+
+def write_parquet(path: Path, table: pa.Table) -> None:
+    """Write a table as parquet atomically, compressed with zstd."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd")
+    write_bytes(path, sink.getvalue().to_pybytes())
+
+
+def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
+    """Write the rows of many parquet files into one, atomically and in order, in the memory of one row group."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as partial, pq.ParquetWriter(partial, schema, compression="zstd") as writer:
+        held: list[pa.Table] = []
+        rows = 0
+        for part in parts:
+            with pq.ParquetFile(part) as file:
+                held.append(file.read(use_threads=False))  # a few kilobytes each
+            rows += len(held[-1])
+            if rows >= GROUP_ROWS:
+                writer.write_table(pa.concat_tables(held))
+                held, rows = [], 0
+        writer.write_table(pa.concat_tables(held) if held else schema.empty_table())
+
+
+@dataclass(frozen=True)
+class LoggedScene:
+    """A scene that logs are scored against, with the facts that a report shows."""
+
+    scene: Scene
+    source: str
+    content_hash: str
+    notes: tuple[str, ...]
+    actors: Sequence[Actor]
+    world_origin: tuple[float, float, float]
+    start_us: int = 0
+    end_us: int = 0
+    warmup_us: int = 0
+
+
+def write_scene(root: Path, scenario: Scenario | LoggedScene) -> None:
+    """Write the file of a scene into a run folder."""
+    write_json(root / SCENES / f"{slug(scenario.scene.scene_id)}.json", scene_as_json(scenario))
+
+
+def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
+    """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a centimetre."""
+    scene, log = scenario.scene, scenario.scene.ego_log
+    lanes = [
+        {
+            "id": lane.lane_id,
+            "kind": lane.kind,
+            "centre": _xy(lane.centre),
+            "left": _xy(lane.left) if lane.left is not None else None,
+            "right": _xy(lane.right) if lane.right is not None else None,
+            "paint": [lane.left_paint, lane.right_paint],
+        }
+        for lane in scene.lane_map.lanes.values()
+    ]
+    keep = np.unique(np.linspace(0, len(log) - 1, min(len(log), 400)).astype(int))
+    return {
+        "scene_id": scene.scene_id,
+        "source": scenario.source,
+        "content_hash": scenario.content_hash,
+        "notes": list(scenario.notes),
+        "world_origin": list(scenario.world_origin),
+        "start_us": scenario.start_us,
+        "end_us": scenario.end_us,
+        "warmup_us": scenario.warmup_us,
+        "lanes": lanes,
+        "road_edges": [_xy(edge) for edge in scene.lane_map.road_edges],
+        "crosswalks": [_xy(ring) for ring in scene.lane_map.crosswalks],
+        "ego_log": {"t_us": log.t_us[keep].tolist()} | {f"{axis}_m": np.round(log.xyz[keep, i], 3).tolist() for i, axis in enumerate("xy")},
+        "vehicle": {
+            "length_m": scene.vehicle.box.length_m,
+            "width_m": scene.vehicle.box.width_m,
+            "rear_axle_to_centre_m": scene.vehicle.rear_axle_to_centre_m,
+        },
+        "actors": [_actor(scenario, actor) for actor in scenario.actors],
+    }
+
+
+def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
+    """Return what a drawing needs of a road user: its size, and its track every `ACTOR_STEP_US` while the scene runs."""
+    track = actor.track
+    is_timed = scenario.end_us > scenario.start_us  # a scene that logs are scored against need not say when it runs
+    inside = np.flatnonzero((track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us)) if is_timed else np.arange(len(track))
+    if actor.is_static:
+        inside = inside[:1] if len(inside) else np.array([0])
+    step = max(1, round(ACTOR_STEP_US / max(1.0, float(np.median(np.diff(track.t_us)))))) if len(track) > 1 else 1
+    keep = np.unique(np.concatenate([inside[::step], inside[-1:]]))
+    yaw = yaw_from_quat(track.quat[keep])
+    return {
+        "id": actor.actor_id,
+        "label": actor.label,
+        "static": actor.is_static,
+        "reacts": actor.behaviour.kind != "replay",
+        "length_m": actor.box.length_m,
+        "width_m": actor.box.width_m,
+        "t_us": track.t_us[keep].tolist(),
+        "x_m": np.round(track.xyz[keep, 0], 2).tolist(),
+        "y_m": np.round(track.xyz[keep, 1], 2).tolist(),
+        "yaw_rad": np.round(yaw, 3).tolist(),
+    }
+
+
+def _xy(line: F64) -> list[list[float]]:
+    rounded: list[list[float]] = np.round(line[:, :2], 2).tolist()
+    return rounded

@@ -1,1 +1,0 @@
-"""Subprocesses and their supervisor, signals, standard output."""

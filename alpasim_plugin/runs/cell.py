@@ -1,0 +1,298 @@
+"""One cell of a run: build its parts, drive, score, write. Runs in a worker process."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+
+from alpasim_plugin.control import Controller
+from alpasim_plugin.core.atomic import disk_error
+from alpasim_plugin.core.errors import PolicyError, SimrunError
+from alpasim_plugin.core.interfaces import Policy, Renderer
+from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
+from alpasim_plugin.core.places import require_kernels
+from alpasim_plugin.core.subprocesses import parts_print_to_stderr
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.log.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest
+from alpasim_plugin.log.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME, WHY_NAME
+from alpasim_plugin.log.run_folder.writer import write_steps
+from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.plan import Cell, RunOptions
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.rollout import run_rollout
+from alpasim_plugin.runs.scoring import score_log
+from scenarios.load import load_scenario
+from scenarios.suite import ScenarioRef
+
+if TYPE_CHECKING:
+    from alpasim_plugin.alpasim.client.world_services import RemoteActors
+
+
+@dataclass(frozen=True)
+class RolloutParts:
+    """The parts of one rollout.
+
+    Attributes:
+        session: Identifies the rollout in its log; equal rollouts have equal ids.
+        names: Name of each service, for the log's header.
+        controller: Moves the ego.
+        actors: Road users behind a service; None: the scenario's own.
+    """
+
+    renderer: Renderer
+    policy: Policy
+    session: str
+    names: Mapping[str, str]
+    controller: Controller
+    actors: RemoteActors | None = None
+
+
+def remote_actors(scenario: Scenario, address: str, seed: int) -> RemoteActors:
+    """Connect a rollout's road users to a traffic service."""
+    from alpasim_plugin.alpasim.client.world_services import RemoteActors  # gRPC is loaded where a service is called
+
+    return RemoteActors(scenario, address, seed)
+
+
+PartsBuilder = Callable[[Cell, RunOptions, Scenario, int], RolloutParts]
+
+
+def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> RolloutParts:
+    """Build the parts that a cell names."""
+    name, fixer = cell.renderer.name, cell.renderer.fixer
+    return RolloutParts(
+        make_renderer(cell.renderer, scenario, cell.seed, options.device, threads),
+        build(cell.policy, scenario=scenario),
+        cell.rollout_key,
+        {"sensorsim": name if fixer is None else f"{name} ({fixer.label})", "egodriver": cell.policy.name},
+        build(cell.controller, vehicle=scenario.vehicle, scene_id=scenario.scene_id),
+        remote_actors(scenario, options.traffic, cell.seed) if options.traffic else None,
+    )
+
+
+def run_cell(
+    cell: Cell,
+    options: RunOptions,
+    root: Path,
+    threads: int,
+    builder: PartsBuilder = build_parts,
+    load: Callable[[ScenarioRef], Scenario] | None = None,
+) -> dict[str, Any]:
+    """Run and score one cell and return its manifest. The manifest is written last: a folder without one is unfinished.
+
+    A failure is a result too: the manifest then has ``status: failed``, the error and the traceback.
+
+    Args:
+        cell: The rollout.
+        options: Of the run.
+        root: The run folder.
+        threads: Of the rollout.
+        builder: Makes the parts.
+        load: Gives the scenario; None reads it from its file.
+    """
+    folder = root / cell.folder
+    began = time.perf_counter()
+    cv2.setNumThreads(1)  # OpenCV's pool is outside the thread budget, and frames are too small to gain from it
+    manifest = _begun(cell) | {"preset": options.preset, "stops_at_path_end": cell.stops_at_path_end, "video": options.video}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (MANIFEST, *DRIVEN, *DERIVED, WHY_NAME):  # the manifest first: without it nothing is trusted
+            (folder / name).unlink(missing_ok=True)
+        scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
+        with parts_print_to_stderr(folder / OUTPUT_NAME):
+            parts = builder(cell, options, scenario, threads)
+            recorder = _drive(parts, cell, options, scenario, folder)
+        manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
+        manifest |= _score(folder, cell, options, scenario)
+        recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
+        manifest["status"] = "ok"
+    except Exception as error:
+        manifest |= _failure(error, folder)
+        _log_traceback(error, folder)
+    manifest["wall_s"] = round(time.perf_counter() - began, 4)
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def _begun(cell: Cell) -> dict[str, Any]:
+    """Return what the manifest of a rollout begins with."""
+    return {**cell.names, "path": cell.folder.as_posix(), "rollout_key": cell.rollout_key, "score_key": cell.score_key}
+
+
+def _drive(parts: RolloutParts, cell: Cell, options: RunOptions, scenario: Scenario, folder: Path) -> Recorder:
+    """Drive a rollout and close its parts, however it ends."""
+    recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
+    held: list[Policy | Controller | RemoteActors] = [complete(parts.policy, Policy), complete(parts.controller, Controller)]
+    if parts.actors is not None:
+        held.append(parts.actors)
+    with recorder, ExitStack() as stack:
+        for part in held:
+            stack.enter_context(_closing(part))
+        run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller, parts.actors)
+    return recorder
+
+
+def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
+    """Return what renderer and policy say of the rollout; a renderer with a fixer speaks for the fixer."""
+    rendered = dict(complete(parts.renderer, Renderer).facts())
+    driven = dict(complete(parts.policy, Policy).facts())
+    facts: dict[str, Any] = {"fixer": rendered if has_fixer else {}}
+    if rendered and not has_fixer:
+        facts["renderer_facts"] = rendered
+    if driven:
+        facts["policy_facts"] = driven
+    return facts
+
+
+def _failure(error: Exception, folder: Path) -> dict[str, Any]:
+    """Return what the manifest says of a rollout that failed; called where the error is handled."""
+    trace = {"traceback": traceback.format_exc()}
+    if isinstance(error, SimrunError):
+        final = isinstance(error, PolicyError) and error.is_final
+        return {"status": "failed", "error": error.as_dict(), "final": final} | trace
+    if isinstance(error, OSError):
+        return {"status": "failed", "error": disk_error(folder, error).as_dict()} | trace
+    found = {
+        "doing": "running a rollout",
+        "with": "a part that raised something other than a SimrunError",
+        "found": f"{type(error).__name__}: {error}",
+        "do": "read the traceback in the manifest and report it",
+        "failure_class": "infrastructure",
+    }
+    return {"status": "failed", "error": found} | trace
+
+
+def _log_traceback(error: Exception, folder: Path) -> None:
+    """Add the traceback of what failed first to the log of the rollout, which the terminal names."""
+    cause = error
+    while isinstance(cause.__cause__, Exception):
+        cause = cause.__cause__
+    text = "".join(traceback.format_exception(cause))
+    with (
+        suppress(OSError),
+        (folder / OUTPUT_NAME).open("a", encoding="utf-8") as log,
+    ):  # the disk may be what failed; the manifest has it too
+        log.write(text)
+
+
+def failed_manifest(cell: Cell, error: SimrunError) -> dict[str, Any]:
+    """Return the manifest of a rollout that was never driven to its end."""
+    return _begun(cell) | {"status": "failed", "error": error.as_dict(), "wall_s": None}
+
+
+def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    """Score a finished rollout again from its log: another preset, changed evaluators, or a damaged table; return the new manifest."""
+    folder = root / cell.folder
+    manifest = manifest | _score(folder, cell, options, _scenario(cell.ref))
+    manifest |= {"score_key": cell.score_key, "preset": options.preset}
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def find_rollout_state(
+    cell: Cell,
+    root: Path,
+    reuse_undigested: bool = False,
+    full: bool = False,
+    known: bool = False,
+    retry: bool = False,
+    video: str = "none",
+) -> tuple[RepairAction, RolloutState]:
+    """Return what a cell needs, and the rollout as it is found on disk.
+
+    A rollout with another content key is driven again; so are those with a part that has no digest unless ``reuse_undigested`` is set, and
+    failed ones, except where the policy is at fault: the same policy would fail again (``retry`` drives these too).
+    One that was driven without the ``video`` that is asked for now is driven again as well. See
+    `alpasim_plugin.log.run_folder.manifests.inspect_rollout` for ``full`` and ``known``.
+    """
+    state = inspect_rollout(root, cell.folder.as_posix(), full, known)
+    manifest = state.manifest
+    if manifest is None or manifest.get("rollout_key") != cell.rollout_key:
+        return "drive", state
+    if manifest["status"] != "ok" and (retry or not manifest.get("final")):
+        return "drive", state
+    if cell.undigested and not reuse_undigested:
+        return "drive", state
+    if manifest["status"] != "ok":
+        return "none", state
+    if manifest.get("passed_path_end") and manifest.get("stops_at_path_end") != cell.stops_at_path_end:
+        return "drive", state  # the only rollouts that differ between presets that stop there and those that drive on
+    wants_video = video == "all" or (video == "failures" and bool(manifest.get("events")))
+    if wants_video and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video:
+        return "drive", state
+    if state.action == "none" and manifest.get("score_key") != cell.score_key:
+        return "score", state
+    return state.action, state
+
+
+def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
+    scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators)
+    write_steps(folder, [cell.names | row for row in scored.steps])
+    return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
+
+
+@contextmanager
+def _closing(part: Policy | Controller | RemoteActors) -> Iterator[None]:
+    """Close a part after its rollout."""
+    try:
+        yield
+    except BaseException:
+        with suppress(SimrunError):  # what failed first is the rollout's failure; a service that is gone cannot be closed either
+            part.close()
+        raise
+    part.close()
+
+
+@lru_cache(maxsize=4)
+def _scenario(ref: ScenarioRef) -> Scenario:
+    return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+
+
+def make_renderer(
+    name: str | RendererSpec,
+    scenario: Scenario,
+    seed: int = 0,
+    device: str = "cpu",
+    threads: int | None = None,
+    overrides: Sequence[str] = (),
+) -> Renderer:
+    """Build one rollout's renderer.
+
+    Args:
+        name: A renderer, or a fixer over one, as `alpasim_plugin.core.parts.resolve_renderer` takes it; or its resolved spec.
+        scenario: What is rendered.
+        seed: The rollout's seed, for temporal noise and the fixer's noise.
+        device: ``cpu`` or ``cuda``.
+        threads: Threads of the CPU rasteriser and of torch; None keeps their settings.
+        overrides: ``KEY=VALUE`` of the fixer's settings, where ``name`` is a string.
+
+    Raises:
+        InputError: Unknown name, device or setting, or weights that are missing or wrong.
+        RendererError: The device does not work.
+        InfrastructureError: Kernels cannot be compiled: no folder can be written.
+    """
+    require_kernels()
+    spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
+    session = {"seed": seed, "device": device, "threads": threads}
+    base: Renderer = build(spec.base, scenario=scenario, **session)
+    if spec.fixer is None:
+        return base
+    from alpasim_plugin.fixers.loop import fixed_renderer
+    from alpasim_plugin.fixers.settings import FixerSettings
+
+    fixer, settings = spec.fixer, spec.fixer.settings
+    assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
+
+    def render(request: RenderRequest) -> Frame:
+        return checked_frames(base, [request])[0]
+
+    recorded = base.recorded() if settings.references else ()
+    return fixed_renderer(render, lambda: build(fixer, scene_id=scenario.scene_id, **session), settings, scenario, threads, recorded)

@@ -1,0 +1,284 @@
+"""Run the cells of a plan: in this process for one worker, in spawned processes for more, or on the nodes of a cluster.
+
+A cell's result does not depend on where or when it runs: every random stream is keyed by (scene, seed, component, step) and the
+rasteriser is bit-equal for any number of threads. Workers may therefore run cells in any order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core import kernels
+from alpasim_plugin.core.cache import cache_root, cached, share_measurements
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.run_folder.manifests import write_manifest
+from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
+from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runs.certificate import Repeat
+from alpasim_plugin.runs.commits import KnownCommits, opened, run_stored_cell, unpack
+from alpasim_plugin.runs.executors.assignment import assignment_as_here, measured_folder, targets_of
+from alpasim_plugin.runs.executors.base import Lost
+from alpasim_plugin.runs.executors.choice import LOCAL, Executor, opened_backend
+from alpasim_plugin.runs.executors.local import run_in_processes, run_or_retry
+from alpasim_plugin.runs.executors.pool import run_jobs
+from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
+from alpasim_plugin.runs.provenance import hardware
+
+KERNELS = "kernels"
+GAUSSIANS = ("clean", "3dgs")  # base renderers that draw Gaussians themselves
+
+
+def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers: int) -> None:
+    """Compile what rollouts need that several workers are about to drive; nothing where that was done before.
+
+    Args:
+        todo: The rollouts.
+        scenarios: Their scenarios by scene.
+        workers: Processes. One compiles nothing here: it compiles while it drives.
+    """
+    if workers < 2:
+        return
+    cold = [one for one in needed(todo, scenarios) if is_cold(one)]
+    if not cold:
+        return
+    for subject, got in run_in_processes(compile_kernels, cold, min(workers, len(cold)), 1):
+        if isinstance(got, Lost):
+            print(f"warning: compiling {subject} kernels: {got.found}; the rollouts compile them", file=sys.stderr, flush=True)
+
+
+def is_cold(subject: str) -> bool:
+    """Tell whether the kernels of a subject are still to be compiled."""
+    return not kernels.covers(subject) and not (cache_root() / KERNELS / _key(subject)).exists()
+
+
+def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:
+    """Return the subjects of `kernels.SUBJECTS` whose kernels some rollouts call."""
+    found = set()
+    for cell in todo:
+        if cell.renderer.base.name in GAUSSIANS:
+            found.add("rasteriser")
+        if cell.renderer.base.name == "3dgs" and is_reconstructed(scenarios[cell.scene]):
+            found.add("gradient")
+        if cell.renderer.fixer is not None:
+            found |= {"map", "network"}
+    return [subject for subject in kernels.SUBJECTS if subject in found]
+
+
+def compile_kernels(subject: str) -> None:
+    """Compile the kernels of a subject on a tiny case, unless that was done; wait where another process is about to."""
+
+    def make(folder: Path) -> None:
+        kernels.call(subject)
+
+    cached(KERNELS, _key(subject), make, lambda folder: folder, f"compiling {subject} kernels, once on this machine")
+
+
+def _key(subject: str) -> str:
+    """Name what is compiled as numba does: by the code, numba's version, its folder, the processor."""
+    facts = repr((version("numba"), os.environ.get("NUMBA_CACHE_DIR"), hardware()["cpu"]))
+    return f"{kernels.subject_name(subject)}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
+
+
+OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
+
+
+@dataclass(frozen=True)
+class Threads:
+    """The thread budget: workers x threads per worker never exceeds the cores."""
+
+    workers: int
+    per_worker: int
+
+
+def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL, repeats: bool = False) -> Threads:
+    """Divide the cores that this process may use among the workers; those of other nodes have the cores that the executor asks for.
+
+    Args:
+        workers: Number of workers; None is one per core. Never more than cells. On other nodes it is the most, and None is no bound.
+        n_cells: Number of cells to run.
+        executor: Where rollouts run.
+        repeats: A worker of this machine drives one of them again.
+    """
+    if not executor.is_local:
+        return Threads(max(1, min(workers or n_cells, n_cells)), executor.resources.cores)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    chosen = max(1, min(workers or cores, max(n_cells, 1) + repeats))
+    return Threads(chosen, max(1, cores // chosen))
+
+
+@dataclass(frozen=True)
+class HowToRun:
+    """What decides how a plan is executed, and nothing of its results.
+
+    Attributes:
+        threads: Workers, and threads of each.
+        reuse_undigested: Also reuse rollouts with parts that have no digest.
+        full: Read every file of a finished rollout before it is reused, even if size and time are as written.
+        retry: Drive again also what failed by the policy's own fault.
+        limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
+        executor: Where rollouts run.
+        store: URL of a store in which rollouts are looked up and committed; None: the run folder alone.
+        run: Token by which the processes of the run know each other.
+    """
+
+    threads: Threads
+    reuse_undigested: bool = False
+    full: bool = False
+    limit_s: float | None = None
+    retry: bool = False
+    executor: Executor = LOCAL
+    store: str | None = None
+    run: str = field(default_factory=lambda: os.urandom(8).hex())
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Give what ``run.json`` says of executor and store; nothing for a run on this machine alone."""
+        return {} if self.executor.is_local and self.store is None else {"executor": str(self.executor), "store": self.store}
+
+    @property
+    def cores_here(self) -> int:
+        """Give the cores of this machine that a rollout may use when the others are done."""
+        here = self.threads if self.executor.is_local else thread_budget(1, 1)
+        return here.workers * here.per_worker
+
+
+def execute(
+    plan: RunPlan,
+    root: Path,
+    how: HowToRun,
+    on_done: OnDone,
+    notify: Callable[[str], None],
+    known: Collection[str] = (),
+    repeat: Repeat | None = None,
+) -> list[dict[str, Any]]:
+    """Run every unfinished cell and return all manifests in the plan's order.
+
+    Whole rollouts are reused; those scored with another preset, or whose table is damaged, are scored again from their logs; damaged
+    ones are driven again. On SIGINT, SIGTERM or SIGHUP the workers are stopped; finished rollouts stay on disk.
+
+    Args:
+        plan: The run.
+        root: Its folder.
+        how: Workers, checks, limits.
+        on_done: Called with each manifest.
+        notify: Called with one line for each damaged rollout.
+        known: Folders of rollouts that were finished once.
+        repeat: Driven again beside the others, if workers of this machine drive it now.
+    """
+    share_measurements(measured_folder(how.run))
+    manifests: dict[Path, dict[str, Any]] = {}
+    todo: list[Cell] = []
+    store = None if how.store is None else KnownCommits(opened(how.store), plan.options, how.reuse_undigested)
+    for cell in plan.cells:
+        folder = cell.folder.as_posix()
+        action, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
+        if state.damage:
+            doing = "driving again" if action == "drive" else "scoring again"
+            notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
+        if action == "drive" or state.manifest is None:
+            stored = store and store.find(cell)
+            if not stored:
+                todo.append(cell)
+                continue
+            manifest = _scored(cell, plan.options, root, unpack(stored, root))
+        else:
+            manifest = state.manifest if action == "none" else rescore_cell(cell, plan.options, root, state.manifest)
+        manifests[cell.folder] = manifest
+        on_done(manifest, True)
+    if how.executor.is_local:
+        driven = _run_local(todo, plan, root, how, store, repeat)
+    else:
+        driven = _run_elsewhere(todo, plan, root, how, store, notify)
+    for cell, manifest in driven:
+        manifest = _scored(cell, plan.options, root, manifest)
+        manifests[cell.folder] = manifest
+        on_done(manifest, False)
+        if store is not None:
+            store.add(cell, manifest)
+    if store is not None:
+        store.commits.index.flush()
+    return [manifests[cell.folder] for cell in plan.cells]
+
+
+def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    """Score a rollout that comes from a store, or from an earlier driver, again if its scores are another preset's."""
+    if manifest["status"] != "ok" or manifest["score_key"] == cell.score_key:
+        return manifest
+    return rescore_cell(cell, options, root, manifest)
+
+
+Done = Iterator[tuple[Cell, dict[str, Any]]]
+
+
+def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, repeat: Repeat | None) -> Done:
+    """Run cells in this process, or in workers that write the run folder themselves."""
+    if how.threads.workers > 1 or how.limit_s is not None:
+        compile_for(todo, plan.scenarios, how.threads.workers)
+    threads = how.threads.per_worker
+    drive: Callable[..., dict[str, Any]] = partial(run_cell, options=plan.options, threads=threads)
+    work: Callable[..., dict[str, Any]] = drive
+    if how.store is not None and store is not None:
+        work = partial(run_stored_cell, options=plan.options, threads=threads, store=how.store, fresh=store.fresh)
+    jobs = [_Job(cell, root, work) for cell in todo]
+    if how.threads.workers > 1:
+        if repeat is not None and repeat.cell is not None and repeat.cell in todo:
+            jobs.append(_Job(repeat.cell, repeat.root, drive))
+        jobs.sort(key=lambda job: job.cell.renderer.fixer is None)  # what takes longest comes first, so that all workers end together
+
+    def known(job: _Job) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
+        action, state = find_rollout_state(job.cell, job.root, reuse_undigested=True)
+        return state.manifest if action == "none" else None
+
+    for job, got in run_or_retry(partial(_of_run, how.run), jobs, how.threads.workers, threads, how.limit_s, known):
+        if repeat is not None and job.root is repeat.root:
+            repeat.manifest = None if isinstance(got, Lost) else got
+        else:
+            yield job.cell, _lost(job.cell, root, got) if isinstance(got, Lost) else got
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One rollout for a worker of this machine: where it is written, and by what it is driven."""
+
+    cell: Cell
+    root: Path
+    work: Callable[..., dict[str, Any]]
+
+
+def _of_run(run: str, job: _Job) -> dict[str, Any]:
+    """Run a cell in a worker of this machine."""
+    share_measurements(measured_folder(run))
+    return job.work(job.cell, root=job.root)
+
+
+def _run_elsewhere(
+    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, notify: Callable[[str], None]
+) -> Done:
+    """Run cells on other nodes; only this process writes the run folder."""
+    if not todo:
+        return
+    from alpasim_plugin.runs.executors.job import rollout_work  # a run on this machine needs none of it
+
+    work, contents = rollout_work(plan, how.run, todo, how.threads.per_worker, how.store, store.fresh if store else "")
+    workers = min(how.threads.workers, len(todo))
+    assignment = assignment_as_here(work, contents, targets_of(plan.parts), how.executor.resources, workers, notify)
+    with opened_backend(how.executor, assignment, root) as backend:
+        for cell, got in run_jobs(backend, todo, notify, how.limit_s):
+            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
+
+
+def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
+    """Write the manifest of a rollout whose workers died, or that was ended since it took too long."""
+    error = InfrastructureError("running a rollout in a worker process", cell.folder.as_posix(), lost.found, lost.do_this)
+    manifest = failed_manifest(cell, error)
+    write_manifest(root / cell.folder, manifest)
+    return manifest

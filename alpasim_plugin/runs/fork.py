@@ -1,0 +1,280 @@
+"""Continue a logged rollout from an instant on with another renderer, policy or seed.
+
+Up to that instant the rollout is replayed with its own parts and compared with its log, component by component, bit for bit. The replay
+restores the whole state: the ego's speed and steering, reactive actors, the policy's memory, the renderer's history. A log alone does not
+hold it (its poses are float32, and it has no policy state). If the replay differs from the log, an error names the component and the step.
+
+The new parts get the same inputs before the instant, so that they have the same history: a renderer renders every request, a policy gets
+every query. Their outputs before the instant are discarded.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
+from alpasim_plugin.core.parts import digest, resolve, resolve_renderer
+from alpasim_plugin.core.types import EgoState, Frame, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO
+from alpasim_plugin.log.run_folder.writer import writing
+from alpasim_plugin.log.trace import Difference, Trace, first_difference
+from alpasim_plugin.runs.cell import RolloutParts, build_parts, run_cell
+from alpasim_plugin.runs.certificate import log_trace
+from alpasim_plugin.runs.execute import thread_budget
+from alpasim_plugin.runs.logged_rollout import LoggedRollout
+from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan, score_key
+from alpasim_plugin.runs.run import RunResult, finish_run, write_run_info
+from alpasim_plugin.runs.summary import pool_of
+
+DOING = "continuing a logged rollout"
+UNCHANGED = "replay"
+
+
+class SwitchedRenderer(Renderer):
+    """Render with ``first`` before ``at_us`` and with ``then`` from it on.
+
+    Raises:
+        InputError: Their block rules differ.
+    """
+
+    def __init__(self, first: Renderer, then: Renderer, at_us: int) -> None:
+        self.first, self.then, self.at_us = first, then, at_us
+        self.block = first.block
+        if first.block != then.block:
+            raise InputError(
+                "switching to another renderer",
+                f"{first.block or 'frames one by one'} and {then.block or 'frames one by one'}",
+                "the two have different query times of the policy",
+                "choose the mode 'speculative' for both",
+            )
+        self.lookahead = max(first.lookahead, then.lookahead)
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render one frame."""
+        return self.render_batch([request])[0]
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
+        """Render the frames of an instant or of a block; the end of a block decides which part renders it."""
+        early = max(request.t_us for request in requests) < self.at_us
+        used = self.first if early else self.then
+        frames = used.render_batch(requests)
+        self.stage_ms = dict(used.stage_ms)
+        if early and self.then is not self.first:
+            self.then.render_batch(requests)
+        return frames
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fixer facts of the second part, or of the first if the second has none."""
+        return dict(self.then.facts() or self.first.facts())
+
+
+class SwitchedPolicy(Policy):
+    """Plan with ``first`` before ``at_us`` and with ``then`` from it on.
+
+    Args:
+        first: Reset with the rollout's seed.
+        then: Reset with ``then_seed``.
+        at_us: When to switch.
+        then_seed: Seed of the second policy.
+        camera_us: The scenario's camera period.
+    """
+
+    def __init__(self, first: Policy, then: Policy, at_us: int, then_seed: int, camera_us: int) -> None:
+        self.first, self.then, self.at_us, self.then_seed = first, then, at_us, then_seed
+        self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, camera_us)
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Reset both."""
+        self.first.reset(seed, route)
+        if self.then is not self.first:
+            self.then.reset(self.then_seed, route)
+
+    def act(self, observation: Observation) -> Plan:
+        """Return the plan of the active policy."""
+        early = observation.t_us < self.at_us
+        plan = (self.first if early else self.then).act(observation)
+        if early and self.then is not self.first:
+            self.then.act(observation)
+        return plan
+
+
+class SwitchedController(Controller):
+    """Drive with ``first`` before ``at_us`` and with ``then`` from it on; the first call of ``then`` gives it the state to begin with."""
+
+    def __init__(self, first: Controller, then: Controller, at_us: int) -> None:
+        self.first, self.then, self.at_us = first, then, at_us
+        self.grounds = first.grounds and then.grounds
+
+    def close(self) -> None:
+        """Close both."""
+        self.first.close()
+        if self.then is not self.first:
+            self.then.close()
+
+    def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
+        """Return the state at ``to_us``."""
+        return (self.first if state.t_us < self.at_us else self.then).advance(state, plan, to_us)
+
+
+def merge_sensors(first: Sequence[SensorSpec], then: Sequence[SensorSpec], camera_us: int) -> tuple[SensorSpec, ...]:
+    """Return the cameras of two policies; a camera of both has the shorter of its periods.
+
+    Args:
+        first: Cameras of one.
+        then: Cameras of the other.
+        camera_us: The scenario's camera period, meant by a sensor's interval of 0.
+    """
+    joined = {sensor.camera: sensor for sensor in first}
+    for sensor in then:
+        known = joined.get(sensor.camera)
+        if known is None or (sensor.interval_us or camera_us) < (known.interval_us or camera_us):
+            joined[sensor.camera] = sensor
+    return tuple(joined.values())
+
+
+@dataclass(frozen=True)
+class Change:
+    """Which parts are replaced ``after_us`` after the first frame; None keeps the logged one."""
+
+    after_us: int
+    renderer: str | None = None
+    policy: str | None = None
+    seed: int | None = None
+
+    @property
+    def label(self) -> str:
+        """Name the continuation in tables, in the column of renderers."""
+        parts = [self.renderer or "", self.policy or "", f"seed {self.seed}" if self.seed is not None else ""]
+        return f"{', '.join(part for part in parts if part) or UNCHANGED} from {self.after_us * 1e-6:g} s"
+
+    def apply(self, cell: Cell, fixer: Sequence[str]) -> Cell:
+        """Return the cell with the replaced parts; ``fixer`` are the run's fixer settings."""
+        renderer = cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
+        policy = cell.policy if self.policy is None else resolve("policy", self.policy)
+        controller = cell.controller if self.policy is None else resolve("controller", policy.controller)
+        return replace(cell, renderer=renderer, policy=policy, controller=controller, seed=cell.seed if self.seed is None else self.seed)
+
+
+def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
+    """Continue a rollout and write a run folder with the original and the continuation side by side.
+
+    In the tables the continuation is a renderer of its own (`Change.label`), paired with the original: same policy name, scene and seed.
+    ``fork`` in ``run.json`` and in the manifest holds the change, the result of the replay and, for an empty change, whether the
+    continuation equals the log.
+
+    Args:
+        past: The logged rollout.
+        change: Which parts are replaced, and when.
+        root: Run folder to write; must not hold a run.
+        video: Whether to write the continuation's video.
+        command: For ``run.json``.
+
+    Raises:
+        InputError: The instant lies outside the rollout, its latency is measured, or ``root`` holds a run.
+        InfrastructureError: The replay is not equal to the log up to the instant, or a part failed.
+    """
+    _check(past, change, root)
+    with writing(root):
+        return _fork(past, change, root, video, command)
+
+
+def _fork(past: LoggedRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
+    _check(past, change, root)  # once more: another process may have been first
+    began = time.perf_counter()
+    options = replace(past.options, video=video, baseline=past.cell.renderer.name)
+    then = change.apply(past.cell, options.fixer)
+    original = _copied(past, root)
+    key = digest([past.cell.rollout_key, asdict(change), then.renderer.digest, then.policy.digest, then.controller.digest])
+    label = replace(then.renderer, name=change.label)
+    fork = replace(past.cell, renderer=label, rollout_key=key, score_key=score_key(key, options.preset, past.cell.evaluators))
+    threads = thread_budget(1, 1)
+    at_us = past.scenario.start_us + change.after_us
+    manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change))
+    if manifest["status"] == "ok":
+        manifest["fork"] = asdict(change) | {"of": past.name} | _compare_with_log(past, change, at_us, root / fork.folder)
+        write_manifest(root / fork.folder, manifest)
+    cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
+    plan = RunPlan(cells, {past.cell.scene: past.scenario}, renderers, (past.cell.policy,), (past.cell.seed,), options)
+    write_run_info(root, plan, command, threads)
+    write_run_json(root, read_run_json(root) | {"kind": "fork", "fork": manifest.get("fork")})
+    pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
+    summary = finish_run(root, [original, manifest], {"pool": pool})
+    return RunResult(root, summary, 2, summary["failures"]["n_failed"])
+
+
+def _check(past: LoggedRollout, change: Change, root: Path) -> None:
+    scenario = past.scenario
+    length_us = int(past.manifest["steps"]) * scenario.rates.control_us
+    if not 0 <= change.after_us < length_us:
+        found = f"the rollout lasts {length_us * 1e-6:g} s"
+        raise InputError(DOING, f"--at {change.after_us * 1e-6:g}", found, "choose an instant within it, in seconds after the first frame")
+    past.check_repeatable(DOING)
+    if (root / RUN_INFO).exists():
+        raise InputError(DOING, f"--out {root}", "it holds a run already", "choose another --out")
+
+
+def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:
+    """Copy the original rollout's folder and return its manifest."""
+    folder = root / past.cell.folder
+    shutil.copytree(past.folder, folder, dirs_exist_ok=True)
+    manifest = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> RolloutParts:
+    """Build the original's parts and those that replace them, switched at the instant; an unchanged part is one object."""
+    at_us = scenario.start_us + change.after_us
+    before = build_parts(own, options, scenario, threads)
+    after = before if then == own else build_parts(then, options, scenario, threads)
+    same_renderer = (then.renderer, then.seed) == (own.renderer, own.seed)
+    same_policy = (then.policy, then.seed) == (own.policy, own.seed)
+    next_policy = before.policy if same_policy else after.policy
+    return RolloutParts(
+        SwitchedRenderer(before.renderer, before.renderer if same_renderer else after.renderer, at_us),
+        SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario.rates.camera_us),
+        own.rollout_key if then == own else fork.rollout_key,
+        before.names if then == own else after.names,
+        SwitchedController(before.controller, after.controller, at_us),
+    )
+
+
+def _compare_with_log(past: LoggedRollout, change: Change, at_us: int, folder: Path) -> dict[str, Any]:
+    """Compare the replay with the log up to the instant; for an empty change also the continuation.
+
+    Raises:
+        InfrastructureError: They differ before the instant.
+    """
+    one, other = log_trace(past.folder), log_trace(folder)
+    # Another policy may have more cameras; their frames before the instant have no logged counterpart.
+    other["frames"] = {key: value for key, value in other["frames"].items() if key in one["frames"] or key[0] >= at_us}
+    where = (past.scenario.start_us, past.scenario.rates.control_us)
+    # The pose at the instant follows from the original parts; its frames and its plan come from the new ones.
+    until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
+    difference = first_difference(one, other, *where, until)
+    if difference is not None:
+        (folder / MANIFEST).unlink()
+        raise InfrastructureError(
+            DOING,
+            past.name,
+            f"its replay differs from the log before the change: {difference}",
+            "use the machine and the versions in run.json, or run the rollout again",
+        )
+    if change == Change(change.after_us):
+        return {"replay": "equal", "continuation": _continuation(one, other, past, folder, where)}
+    return {"replay": "equal"}
+
+
+def _continuation(one: Trace, other: Trace, past: LoggedRollout, folder: Path, where: tuple[int, int]) -> Mapping[str, Any] | str:
+    difference = first_difference(one, other, *where)
+    if difference is None and (past.folder / LOG_NAME).read_bytes() != (folder / LOG_NAME).read_bytes():
+        difference = Difference("log", where[0], None, "an entry that belongs to no component")
+    return "equal" if difference is None else difference.as_dict()

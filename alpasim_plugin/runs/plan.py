@@ -1,0 +1,278 @@
+"""The plan of a run: its cells, renderer x policy x scene x seed, with resolved parts and content keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
+from alpasim_plugin.core.parts.source import COMMAND, own_code_digest
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.run_folder.schema import rollout_folder
+from alpasim_plugin.renderers.background import background_note
+from evaluators import resolve_evaluators
+from evaluators.metrics.presets import DEFAULT, preset
+from scenarios.load import code_digest_of, load_scenario
+from scenarios.suite import ScenarioRef
+
+DOING = "planning a run"
+LOOP, SCORING = "alpasim_plugin.runs.rollout", "alpasim_plugin.runs.scoring"  # modules whose code, with its imports, decides
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Everything except the cells that determines a run's results."""
+
+    preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = DEFAULT
+    images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = "jpeg"
+    video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "none"
+    device: Annotated[Literal["cpu", "cuda"], Flag("Where renderers compute.")] = "cpu"
+    baseline: Annotated[str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.", names="renderer")] = None
+    fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
+    controller: Annotated[str | None, Flag("Controller that tracks the plans; by default the policy's.", names="controller")] = None
+    evaluators: Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")] = ()
+    traffic: Annotated[str | None, Flag("AlpaSim's traffic service moves the other road users.", metavar="HOST:PORT")] = None
+
+
+def options_of(info: Mapping[str, Any]) -> RunOptions:
+    """Return the options of an earlier run, as its ``run.json`` states them."""
+    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
+    return RunOptions(**stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")})
+
+
+def ref_of(stated: Mapping[str, Any]) -> ScenarioRef:
+    """Return how a scenario was named when it was driven, as ``run.json`` states it in a scene's ``ref``."""
+    return ScenarioRef(stated["path"], stated.get("seed"), tuple(stated.get("overrides") or ()), stated.get("source"))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One rollout to run: its parts and its identity."""
+
+    renderer: RendererSpec
+    policy: PartSpec
+    controller: PartSpec
+    scene: str  # scene id
+    seed: int
+    ref: ScenarioRef
+    evaluators: tuple[PartSpec, ...]
+    rollout_key: str  # digest of everything that determines the log
+    score_key: str  # digest of rollout_key and of everything that determines the scores
+    stops_at_path_end: bool = True  # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
+    undigested: tuple[str, ...] = ()  # parts without a digest (remote services): the rollout is reused on request only
+
+    @property
+    def folder(self) -> Path:
+        """Give the rollout's folder below the run folder."""
+        return rollout_folder(self.renderer.name, self.policy.name, self.scene, self.seed)
+
+    @property
+    def names(self) -> dict[str, str | int]:
+        """Give the columns that identify the cell in tables."""
+        return {"renderer": self.renderer.name, "policy": self.policy.name, "scene": self.scene, "seed": self.seed}
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """A resolved run.
+
+    Attributes:
+        asked: The scenarios as the command named them: files, folders, suites; in no key.
+        question: Digest of a question that decides which of the cells are driven; empty where all are.
+        whole: The plan that this is a part of, whose keys it bears; see `part_of`.
+    """
+
+    cells: tuple[Cell, ...]
+    scenarios: dict[str, Scenario]
+    renderers: tuple[RendererSpec, ...]
+    policies: tuple[PartSpec, ...]
+    seeds: tuple[int, ...]
+    options: RunOptions
+    asked: tuple[str, ...] = ()
+    question: str = ""
+    whole: RunPlan | None = None
+
+    @property
+    def command_key(self) -> str:
+        """Give a short digest of the command: names, paths and options, not the content of the parts."""
+        if self.whole is not None:
+            return self.whole.command_key
+        named = [[*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides] for cell in self.cells]
+        return digest([named, asdict(self.options), *([self.question] if self.question else [])])[:12]
+
+    @property
+    def content(self) -> str:
+        """Give a short digest of everything that determines the results; it changes with any part."""
+        if self.whole is not None:
+            return self.whole.content
+        return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
+
+    @property
+    def parts(self) -> tuple[PartSpec, ...]:
+        """Give every part that the run builds, each once."""
+        found = [part for cell in self.cells for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)]
+        found += [part for cell in self.cells[:1] for part in cell.evaluators]
+        return tuple({(part.kind, part.name): part for part in found if part is not None}.values())
+
+    @property
+    def undigested(self) -> tuple[str, ...]:
+        """Give the parts without a digest."""
+        return tuple(dict.fromkeys(part for cell in self.cells for part in cell.undigested))
+
+
+def make_plan(
+    refs: Sequence[ScenarioRef],
+    renderers: Sequence[str],
+    policies: Sequence[str],
+    seeds: Sequence[int],
+    options: RunOptions,
+) -> RunPlan:
+    """Load every scenario, resolve every part, and list the cells, scene by scene so that workers reuse a loaded scene.
+
+    Raises:
+        InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given twice.
+    """
+    for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
+        _check_named_once(what, values)
+    rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
+    same = [str(spec) for spec in rendering]
+    if len(set(same)) != len(same):
+        raise InputError(DOING, f"renderers {list(renderers)}", f"they resolve to {same}", "name every renderer once")
+    _check_fixer_settings(options.fixer, renderers, rendering)
+    driving = tuple(resolve("policy", name) for name in policies)
+    moving = {spec.name: resolve("controller", options.controller or spec.controller) for spec in driving}
+    scoring = resolve_evaluators(options.evaluators)
+    loaded = _load(refs)
+    scenarios = {scenario.scene_id: scenario for _, scenario in loaded}
+    code = _Code.of(scenarios.values(), options.preset, scoring)
+    cells = [
+        _cell(scenario, ref, renderer, policy, moving[policy.name], seed, scoring, options, code)
+        for ref, scenario in loaded
+        for renderer in rendering
+        for policy in driving
+        for seed in seeds
+    ]
+    return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def _check_named_once(what: str, values: Sequence[object]) -> None:
+    twice = sorted({str(value) for value in values if list(values).count(value) > 1})
+    if not values or twice:
+        found = f"{', '.join(twice)} twice" if twice else "none"
+        raise InputError(DOING, f"{what}s {', '.join(map(str, values)) or '(none)'}", found, f"name every {what} once")
+
+
+def _check_fixer_settings(settings: Sequence[str], names: Sequence[str], renderers: Sequence[RendererSpec]) -> None:
+    """Refuse settings of fixers that no renderer has."""
+    fixed = {spec.name for spec in renderers if spec.fixer is not None}
+    labels = {label for text in settings if (label := text.partition("=")[0].rpartition(":")[0])}
+    if unknown := sorted(labels - fixed):
+        found = f"no fixer of that name among the renderers {list(names)}"
+        raise InputError(DOING, f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it")
+    if settings and not fixed:
+        found = f"no fixer among the renderers {list(names)}"
+        raise InputError(DOING, f"--set fixer.{settings[0]}", found, "leave it out, or name a fixer")
+
+
+def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
+    """Load scenarios, with a note where the background is not as stated."""
+    loaded: dict[str, tuple[ScenarioRef, Scenario]] = {}
+    for ref in dict.fromkeys(refs):  # what two suites list is driven once
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+        if scenario.scene_id in loaded:
+            both = f"{ref.path} and {loaded[scenario.scene_id][0].path}"
+            found = f"both have the scene id {scenario.scene_id!r}"
+            raise InputError(DOING, both, found, "give one of them another id, or name it once")
+        note = background_note(scenario)
+        loaded[scenario.scene_id] = ref, replace(scenario, notes=(*scenario.notes, note)) if note else scenario
+    return list(loaded.values())
+
+
+def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
+    """Return the part of a plan that consists of some of its cells, with the keys of the whole."""
+    scenes, seeds = {cell.scene for cell in cells}, {cell.seed for cell in cells}
+    scenarios = {name: scenario for name, scenario in plan.scenarios.items() if name in scenes}
+    kept = tuple(seed for seed in plan.seeds if seed in seeds)
+    return replace(plan, cells=tuple(cells), scenarios=scenarios, seeds=kept, whole=plan.whole or plan)
+
+
+def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
+    """Refuse policies that a file names as commands: only what a user types is run.
+
+    Args:
+        policies: Names that were read from a run folder.
+        doing: The attempted action, for the error.
+        where: The run folder, or its file.
+
+    Raises:
+        InputError: One begins with ``exec:``.
+    """
+    for name in policies:
+        if name.startswith(COMMAND):
+            do_this = "give simrun run the same command again: it drives what is missing or damaged"
+            raise InputError(doing, where, f"its policy is a command, {name}; no command is run because a file names it", do_this)
+
+
+@dataclass(frozen=True)
+class _Code:
+    """What the keys of all cells of a plan share; to read it for each cell would cost milliseconds a rollout.
+
+    Attributes:
+        loop: Digest of the loop's code.
+        scoring: What `scoring_content` gives.
+        sources: Scene id -> digest of the code that made the scenario.
+    """
+
+    loop: str
+    scoring: tuple[Any, ...]
+    sources: Mapping[str, str | None]
+
+    @classmethod
+    def of(cls, scenarios: Iterable[Scenario], preset_name: str, evaluators: Sequence[PartSpec]) -> _Code:
+        by_source: dict[str | None, str | None] = {}
+        sources = {}
+        for scenario in scenarios:
+            if scenario.source_part not in by_source:
+                by_source[scenario.source_part] = code_digest_of(scenario)
+            sources[scenario.scene_id] = by_source[scenario.source_part]
+        return cls(own_code_digest(LOOP), scoring_content(preset_name, evaluators), sources)
+
+
+def _cell(
+    scenario: Scenario,
+    ref: ScenarioRef,
+    renderer: RendererSpec,
+    policy: PartSpec,
+    controller: PartSpec,
+    seed: int,
+    evaluators: tuple[PartSpec, ...],
+    options: RunOptions,
+    code: _Code,
+) -> Cell:
+    content: dict[str, str | None] = {
+        f"renderer {renderer.name}": renderer.digest,
+        f"policy {policy.name}": policy.digest,
+        f"controller {controller.name}": controller.digest,
+        f"source of {scenario.scene_id}": code.sources[scenario.scene_id],
+    }
+    if options.traffic is not None:
+        content[f"traffic service {options.traffic}"] = None
+    rollout_key = digest([code.loop, scenario.content_hash, content, seed, options.images, options.device])
+    undigested = tuple(what for what, known in content.items() if known is None)
+    stops = scenario.stop_at_path_end and preset(options.preset).stop_at_path_end
+    scored = digest([rollout_key, *code.scoring])
+    return Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, scored, stops, undigested)
+
+
+def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:
+    """Return the content key of a rollout's scores; it changes with the preset and the code of the evaluators and of the reduction."""
+    return digest([rollout_key, *scoring_content(preset_name, evaluators)])
+
+
+def scoring_content(preset_name: str, evaluators: Sequence[PartSpec]) -> tuple[Any, ...]:
+    """Return what a `score_key` covers besides the rollout: the preset, the code of the scoring, the digest of every evaluator."""
+    return preset(preset_name).as_dict(), own_code_digest(SCORING), [(spec.name, spec.digest) for spec in evaluators]

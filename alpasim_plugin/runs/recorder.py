@@ -1,0 +1,348 @@
+"""Writes the files of one rollout: the log, per-frame facts, a strip of frames and on request a video; collects stage times."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+
+from alpasim_plugin.core.atomic import write_bytes
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.geometry import ego_states_from_log
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.places import temporary_folder
+from alpasim_plugin.core.plan_check import unit_guess
+from alpasim_plugin.core.types import (
+    F64,
+    U8,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    RenderRequest,
+    RolloutLog,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+    Vehicle,
+)
+from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
+from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
+from alpasim_plugin.log.schema import session_uuid
+from alpasim_plugin.runs.loop_state import PathEnd
+
+REACH_S = 1.0
+MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit
+SLACK, SLACK_M = 2.0, 5.0  # a plan may ask for more than the vehicle gives: only what is far beyond counts
+WARN_SHARE, MIN_PLANS = 0.2, 5
+NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+
+
+class StageTimes:
+    """Collects durations by stage name."""
+
+    def __init__(self) -> None:
+        self.durations_s: dict[str, list[float]] = defaultdict(list)
+
+    @contextmanager
+    def measure(self, stage: str, shares: int = 1, within: Callable[[], Mapping[str, float]] | None = None) -> Iterator[None]:
+        """Time one pass through a stage; a stage that raises is timed as well.
+
+        Args:
+            stage: Its name.
+            shares: Number of equal passes it counts as (frames of a block); 0 records nothing.
+            within: Called after the pass; returns the parts of it, in milliseconds, that belong to other stages.
+        """
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            parts = dict(within()) if within is not None and shares else {}
+            parts[stage] = parts.get(stage, 0.0) + 1e3 * (time.perf_counter() - began) - sum(parts.values())
+            for name, part_ms in parts.items():
+                self.durations_s[name] += [1e-3 * part_ms / shares] * shares if shares else []
+
+    def as_ms(self) -> dict[str, list[float]]:
+        """Return all durations in milliseconds, rounded to a microsecond."""
+        return {stage: [round(1e3 * d, 3) for d in durations] for stage, durations in self.durations_s.items() if durations}
+
+
+class PlanMotion:
+    """Counts the plans of one rollout that reach much further, or much less far, than the vehicle can drive.
+
+    A plan's reach is its straight-line advance ``d`` in the first second (or up to its end). At speed ``v`` the vehicle drives at most
+    ``v t + a t^2 / 2`` with full throttle, and at least its braking distance. A plan is beyond the vehicle if ``d`` is more than twice the
+    former and 5 m, and below it if ``d`` is less than a tenth of the latter.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._plans = self._beyond = self._below = 0
+        self._ratios: list[float] = []
+
+    def add(self, plan: Plan, ego: EgoState) -> None:
+        """Count a plan that `alpasim_plugin.core.plan_check.plan_problem` has passed."""
+        t_s = (plan.times_us - plan.times_us[0]) * 1e-6
+        reach_s = min(REACH_S, float(t_s[-1]))
+        if reach_s <= 0.0:
+            return  # one pose: the ego is to stand
+        self._plans += 1
+        advance_m = float(np.hypot(*(np.interp(reach_s, t_s, plan.xy[:, axis]) - plan.xy[0, axis] for axis in (0, 1))))
+        speed, accel, brake = abs(ego.speed_mps), self._vehicle.max_accel_mps2, self._vehicle.max_brake_mps2
+        most_m = speed * reach_s + 0.5 * accel * reach_s**2
+        braking_s = min(reach_s, speed / brake)
+        least_m = speed * braking_s - 0.5 * brake * braking_s**2
+        self._beyond += advance_m > SLACK * most_m + SLACK_M
+        self._below += speed > MOVING_MPS and advance_m < 0.1 * least_m
+        if speed > MOVING_MPS:
+            self._ratios.append(advance_m / (speed * reach_s))
+
+    def facts(self) -> dict[str, Any]:
+        """Return ``plans``, ``beyond``, ``below``, and ``speed_ratio``: median of plan speed over the ego's (None if it never moved)."""
+        ratio = round(float(np.median(self._ratios)), 4) if self._ratios else None
+        return {"plans": self._plans, "beyond": self._beyond, "below": self._below, "speed_ratio": ratio}
+
+
+def plan_table(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return for each renderer the counts of `PlanMotion` over rollouts, and ``warning``: a sentence where plans and vehicle do not fit.
+
+    Args:
+        manifests: Of finished rollouts of one policy; those of scored logs have no plans counted.
+    """
+    out: dict[str, Any] = {}
+    for name in dict.fromkeys(m["renderer"] for m in manifests):
+        facts = [m["plan_motion"] for m in manifests if m["renderer"] == name and m.get("plan_motion")]
+        if not facts:
+            continue
+        ratios = [one["speed_ratio"] for one in facts if one["speed_ratio"] is not None]
+        entry: dict[str, Any] = {key: sum(one[key] for one in facts) for key in ("plans", "beyond", "below")}
+        entry["speed_ratio"] = round(float(np.median(ratios)), 4) if ratios else None
+        out[name] = entry | {"warning": _warning(entry)}
+    return out
+
+
+def _warning(entry: Mapping[str, Any]) -> str:
+    plans, beyond, below, ratio = (entry[key] for key in ("plans", "beyond", "below", "speed_ratio"))
+    found = max(beyond, below)
+    if plans < MIN_PLANS or found < WARN_SHARE * plans:
+        return ""
+    how = "further than the vehicle can drive in that time" if beyond >= below else "less far than its braking distance"
+    said = f"{found} of {plans} plans reach {how}"
+    if ratio is None:
+        return said
+    unit = unit_guess(ratio)
+    return f"{said}; their speed is {ratio:.3g} times the ego's{f', as if in {unit}' if unit else ''}"
+
+
+class Recorder:
+    """Records a rollout in the loop's order.
+
+    Args:
+        scenario: What is driven.
+        seed: Rollout seed, for the log's header.
+        folder: Folder to write; by default a temporary one that is deleted with the recorder.
+        session: Identifies the rollout in the log; equal rollouts have equal ids.
+        images: Encoding of camera frames in the log.
+        keep_frames: Keep every frame for a video, not only those of the strip.
+        versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs", "egodriver": "lane-camera"}``.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int = 0,
+        folder: Path | None = None,
+        session: str = "",
+        images: Literal["none", "jpeg", "png"] = "jpeg",
+        keep_frames: bool = False,
+        versions: Mapping[str, str] | None = None,
+    ) -> None:
+        self._temporary = temporary_folder("simrun-") if folder is None else None
+        self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
+        self._scenario, self._seed = scenario, seed
+        self._session = session_uuid(seed, session or f"{scenario.scene_id}/{seed}")
+        self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
+        self._times = StageTimes()
+        self.plan_motion = PlanMotion(scenario.vehicle)
+        self._frames: list[dict[str, Any]] = []
+        self._pictures: Pictures | None = None
+        self._only_watched = False
+        self._last_query_us = -1
+        self._steps = self._first_call = 0
+        self._passed = False
+        self._writer: AslWriter | None = None
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        if error is not None and self._writer is not None:
+            self._writer.abandon()
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Time one pass through a stage of the loop."""
+        return self._times.measure(name)
+
+    def rendering(self, renderer: Renderer, frames: int) -> AbstractContextManager[None]:
+        """Time the rendering of ``frames`` frames; stages that the renderer reports are timed under their own names."""
+        if self._only_watched:
+            return nullcontext()
+        self._first_call = self._first_call or frames
+        return self._times.measure("render", frames, lambda: renderer.stage_ms)
+
+    def watch(self, scenario: Scenario) -> tuple[SensorSpec, ...]:
+        """Return the camera to render for a policy without one: the scenario's first if a video is kept, else none.
+
+        Its frames go into the pictures alone: neither the log nor times nor scores depend on whether somebody watches.
+        """
+        self._only_watched = self._keep_frames and bool(scenario.cameras)
+        return (SensorSpec(scenario.cameras[0].name),) if self._only_watched else ()
+
+    # --- in the loop's order ----------------------------------------------------------------------------------------
+
+    def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
+        """Open the log and write its header."""
+        if cameras:
+            self._pictures = Pictures(clock, next(iter(cameras)), self._keep_frames)
+        header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps, self._versions)
+        self._writer = AslWriter(self.folder / LOG_NAME, header)
+        self._writer.begin([] if self._only_watched else list(cameras.values()))
+
+    def poses(self, ego: EgoState, actors: Mapping[str, F64]) -> None:
+        """Log the true poses of the ego and the actors."""
+        with self.stage("log"):
+            self._log.actor_poses(ego.t_us, ego.T_world_rig, actors)
+
+    def frame(self, frame: Frame, request: RenderRequest) -> None:
+        """Log one camera frame."""
+        if self._only_watched:
+            if self._pictures is not None:
+                self._pictures.add(frame)
+            return
+        with self.stage("log"):
+            if self._images != "none":
+                self._log.render_request([request], self._images)
+                self._log.camera_image(frame, self._images, request.camera.shutter_us)
+            self._frames.append(
+                {
+                    "t_us": frame.t_us,
+                    "camera": frame.camera,
+                    "opacity_mean": None if frame.alpha is None else round(float(frame.alpha.mean()), 5),
+                    "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
+                    "events": " ".join(frame.events),
+                }
+                | dict(frame.facts)
+            )
+            if self._pictures is not None:
+                self._pictures.add(frame)
+
+    def policy_query(self, observation: Observation, clock: Clock) -> None:
+        """Log a policy query: ego motion and route."""
+        with self.stage("log"):
+            log, history = self._scenario.ego_log, observation.history.t_us
+            unlogged = history[(history > self._last_query_us) & (history < clock.start_us)]
+            context = ego_states_from_log(log, unlogged, self._scenario.vehicle) if len(unlogged) else []
+            self._log.ego_trajectory([*context, observation.ego])
+            self._last_query_us = observation.t_us
+            self._log.route(observation.t_us, observation.route_rig)
+            self._log.driver_request(observation.t_us, observation.t_us + clock.rates.control_us)
+
+    def policy_plan(self, plan: Trajectory, samples: Sequence[Trajectory]) -> None:
+        """Log the policy's plan and its samples, in world coordinates."""
+        with self.stage("log"):
+            self._log.driver_return(plan, samples)
+
+    def control_step(self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool) -> None:
+        """Log one control step."""
+        with self.stage("log"):
+            self._log.controller_request(before, plan if plan is not None else NO_PLAN, after.t_us, forced)
+            self._log.controller_return(after)
+            self._steps += 1
+
+    def finish(self, path_end: PathEnd) -> None:
+        """Close the log and write the per-frame facts."""
+        self._passed = path_end.passed
+        with self.stage("log"):
+            self._log.finish()
+            write_facts(self.folder / FRAMES_NAME, self._frames)
+
+    # --- after the rollout ------------------------------------------------------------------------------------------
+
+    def log(self, images: bool = True) -> RolloutLog:
+        """Read the finished log back."""
+        return read_asl(self.folder / LOG_NAME, images=images)
+
+    def facts(self) -> dict[str, Any]:
+        """Return counts and stage times for the manifest."""
+        events: dict[str, int] = {}
+        for frame in self._frames:
+            for event in frame["events"].split():
+                events[event] = events.get(event, 0) + 1
+        return {
+            "frames": len(self._frames),
+            "first_call_frames": self._first_call,
+            "steps": self._steps,
+            "frame_events": events,
+            "passed_path_end": self._passed,
+            "plan_motion": self.plan_motion.facts(),
+            "stage_ms": self._times.as_ms(),
+            "session_uuid": self._session,
+            "strip_t_us": [] if self._pictures is None else [t_us for t_us, _ in self._pictures.strip()],
+        }
+
+    def save_pictures(self, video: bool) -> None:
+        """Write the strip of frames, and the video if requested."""
+        if self._pictures is not None:
+            self._pictures.save(self.folder, video)
+
+    @property
+    def _log(self) -> AslWriter:
+        if self._writer is None:
+            raise RuntimeError("Recorder.start was not called")
+        return self._writer
+
+
+STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, as fractions of the rollout
+
+
+class Pictures:
+    """Collects the frames of the strip and of the video.
+
+    Args:
+        clock: The rollout's clock.
+        camera: Name of the camera.
+        all_frames: Keep every frame for a video, not only those of the strip.
+    """
+
+    def __init__(self, clock: Clock, camera: str, all_frames: bool) -> None:
+        self._camera, self._all, self._period_us = camera, all_frames, clock.rates.camera_us
+        self._strip_us = [clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us for fraction in STRIP_FRACTIONS]
+        self._kept: list[tuple[int, U8]] = []
+
+    def add(self, frame: Frame) -> None:
+        """Keep a frame that the strip or the video needs."""
+        if frame.camera == self._camera and (self._all or self._in_strip(frame.t_us)):
+            self._kept.append((frame.t_us, frame.rgb))
+
+    def save(self, folder: Path, video: bool) -> None:
+        """Write the strip, and the video if requested; nothing for a rollout without frames."""
+        strip = [rgb for _, rgb in self.strip()]
+        if strip:
+            write_bytes(folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90))
+        if video and self._kept:
+            write_mp4(folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._period_us)
+
+    def _in_strip(self, t_us: int) -> bool:
+        return any(abs(t_us - at_us) * 2 < self._period_us for at_us in self._strip_us)
+
+    def strip(self) -> list[tuple[int, U8]]:
+        """Return times and pixels of the strip's frames."""
+        return [(t_us, rgb) for t_us, rgb in self._kept if self._in_strip(t_us)]

@@ -1,0 +1,137 @@
+"""The reports of a run folder, written together, and what they show of outcomes that flipped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core.atomic import write_bytes, write_json
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.log import decode_image, encode_image
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, WHY_NAME, probe_folder
+from evaluators.metrics.outcomes import outcomes_of
+from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
+from evaluators.opening import Run, read_run
+from evaluators.report import write_junit, write_report, write_summary_md
+from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips, key_of_entry
+from evaluators.viewer.cause import cause_of_log, write_cause
+from evaluators.viewer.cells import read_log
+from evaluators.viewer.page import write_flips_page
+from evaluators.viewer.pictures import smaller
+
+
+def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
+    """Write ``summary.md``, ``junit.xml``, ``flips.html`` and ``report.html`` of a run folder and return the path of the last.
+
+    Args:
+        root: A run folder whose tables are written.
+        flips: Find cells whose outcome differs from their baseline's first; not for scored logs of others.
+        page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an earlier command are removed, and None is
+            returned.
+    """
+    run = read_run(root)
+    replays: Mapping[FlipKey, str] = {}
+    if flips and page:
+        write_flips(run)
+        replays = write_flips_page(run)
+        write_causes(run)
+    write_summary_md(run)
+    write_junit(run)
+    if page:
+        return write_report(run, replays)
+    for name in PAGES:
+        (root / name).unlink(missing_ok=True)
+    return None
+
+
+MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any other
+
+
+def write_causes(run: Run) -> None:
+    """Write the page of a cause for the first drives that failed, one a scene and arm; those of `simrun why` are kept."""
+    told = read_json(run.folder / FLIPS_NAME)["cells"]
+    failed = {one.cell[:3]: one for one in reversed(run.rollouts) if one.ok and outcomes_of(one)}
+    for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
+        if run.file_of(rollout, WHY_NAME) is None:
+            own = [entry for entry in told if key_of_entry(entry)[:4] == rollout.cell]
+            cause = cause_of_log(run, rollout, own)
+            if cause is not None:
+                write_cause(run, cause)
+
+
+MAX_FLIPS = 60  # cells whose logs are read
+PICTURE_WIDTH = 560
+
+
+def write_flips(run_dir: Path | Run) -> Path:
+    """Find the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
+
+    A probe of the same cell and renderers is used where it exists: it renders both at identical poses. Otherwise the two logs are compared;
+    their poses are equal until the plans diverge.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(run_dir)
+    root = run.folder
+    flips, compared = find_flips(run)
+    cells = []
+    for number, flip in enumerate(flips[:MAX_FLIPS]):
+        key = {"renderer": flip.other.renderer, "policy": flip.other.policy, "scene": flip.other.scene, "seed": flip.other.seed}
+        cells.append(key | {"baseline": flip.base.renderer, "against": flip.base.variant} | _divergence(root, flip, f"flips/{number:03d}"))
+    about = {"threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "n_flips": len(flips), "n_pairs": compared}
+    write_json(root / FLIPS_NAME, about | {"cells": cells})
+    return root / FLIPS_NAME
+
+
+def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
+    probe = find_probe(root, flip.base, flip.other.renderer) if flip.base.policy == flip.other.policy else None
+    if probe is not None:
+        return dict(probe) | {"source": "probe"}
+    if not (flip.base.ok and flip.other.ok):
+        return {"t_us": None, "reason": "the policy broke off one of the drives"}
+    try:
+        logs = {name: read_log(root / r.path / LOG_NAME) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)}
+    except SimrunError as error:
+        return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
+    one, other = logs.values()
+    if not one.plans or not other.plans:
+        return {"t_us": None, "reason": "a log without plans"}
+    found = first_divergence(one.plans, other.plans)
+    if found is None:
+        return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
+    divergence: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
+    frames = {side: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (side, log) in enumerate(logs.items())}
+    if None in frames.values():
+        divergence["frames_reason"] = "a log without camera images (--images none, or a policy without cameras)"
+    return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {side: path for side, path in frames.items() if path}}
+
+
+def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:
+    """Return the first divergence that a probe along a rollout found between its renderer and another; None without such a probe."""
+    for path in sorted((root / probe_folder(*driven.cell)).glob(f"*/{PROBE_JSON}")):
+        for pair in read_json(path)["pairs"]:
+            if pair["reference"] == driven.renderer and pair["renderer"] == other:
+                first = pair["first_divergence"]
+                if first is None:
+                    return {"t_us": None, "reason": "a probe at identical poses found no divergence"}
+                frames = {r: (path.parent / name).relative_to(root).as_posix() for r, name in first["frames"].items()}
+                return dict(first) | {"frames": frames}
+    return None
+
+
+def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
+    """Save the first camera's newest frame at a query and return its path; None where the log has none."""
+    if not log.images:
+        return None
+    camera = log.images[0].camera
+    shown = [image for image in log.images if image.camera == camera and image.end_us <= t_us]
+    if not shown:
+        return None
+    rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
+    write_bytes(root / name, encode_image(smaller(rgb, PICTURE_WIDTH), "jpeg", 85))
+    return name

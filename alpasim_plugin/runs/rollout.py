@@ -1,0 +1,139 @@
+"""One closed-loop rollout: scenario -> world -> renderer -> policy -> vehicle -> log, once per tick."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Mapping, Sequence
+
+from alpasim_plugin.control import make_controller
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
+from alpasim_plugin.core.parts import complete
+from alpasim_plugin.core.types import F64, Observation, Plan, Scenario, SensorSpec
+from alpasim_plugin.runs.cameras import CameraRig, make_cadence
+from alpasim_plugin.runs.guards import checked_frames, checked_plan, checked_sensors, reset_policy
+from alpasim_plugin.runs.loop_state import Forecaster, LoopState, PathEnd, PlanQueue
+from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.world.actors import Actors, make_actors
+
+
+def run_rollout(
+    scenario: Scenario,
+    renderer: Renderer,
+    policy: Policy,
+    seed: int = 0,
+    recorder: Recorder | None = None,
+    controller: Controller | None = None,
+    actors: Actors | None = None,
+) -> Recorder:
+    """Drive one scenario once and return its recorder.
+
+    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then the loop is closed. It ends at
+    ``end_us``, or, if the scenario says so, where the ego passes the end of the recorded path (`alpasim_plugin.runs.loop_state`).
+
+    Args:
+        scenario: The scenario.
+        renderer: A session for this rollout alone; see `make_renderer`.
+        policy: Plans from the frames; see `make_policy`.
+        seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.core.seeding`.
+        recorder: Records the rollout; by default into a temporary folder.
+        controller: Vehicle model; by default the policy's, else the bicycle with a tracker.
+        actors: Road users at their beginning; by default those of the scenario.
+
+    Raises:
+        PolicyError: The policy raised or broke its contract.
+        RendererError: The renderer raised, or a frame does not match its request.
+    """
+    recorder = recorder or Recorder(scenario, seed)
+    policy = complete(policy, Policy)
+    controller = complete(controller or make_controller(policy.controller, scenario.vehicle), Controller)
+    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder, actors)
+    reset_policy(policy, seed, scenario.route)
+    driving = loop.drive()
+    try:
+        observation = next(driving)
+        while True:
+            observation = driving.send(checked_plan(policy, observation))
+    except StopIteration:  # the rollout has ended
+        pass
+    policy.end(dict(loop.state.frames))
+    recorder.finish(loop.path_end)
+    return recorder
+
+
+class Loop:
+    """The closed loop of one rollout, which stops wherever a plan is needed: for a policy (`run_rollout`), or for whoever steps it.
+
+    Args:
+        scenario: The scenario.
+        renderer: A session for this rollout alone.
+        sensors: Cameras to render.
+        controller: Vehicle model.
+        recorder: Records the rollout. Whoever drives calls its ``finish``.
+        actors: Road users at their beginning; by default those of the scenario.
+
+    Attributes:
+        state: The ego and the newest frames.
+        actors: Poses of the other road users at the present instant, by id.
+        path_end: Whether the end of the recorded path was passed.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        renderer: Renderer,
+        sensors: Sequence[SensorSpec],
+        controller: Controller,
+        recorder: Recorder,
+        actors: Actors | None = None,
+    ) -> None:
+        self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+        self._renderer, self._controller, self._recorder = complete(renderer, Renderer), controller, recorder
+        self._world = actors or make_actors(scenario)
+        self._plans = PlanQueue(scenario.latency)
+        self.state = LoopState.at_start(scenario, clock.n_steps)
+        self.actors: Mapping[str, F64] = {}
+        self._watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
+        self._cadence = make_cadence(clock, scenario, sensors, self._renderer.block)
+        self.path_end = PathEnd(scenario.ego_log, scenario.stop_at_path_end)
+        forecaster = Forecaster(scenario, controller, self._plans, self._world, self.state)
+        self._rig = CameraRig(scenario, sensors or self._watched, clock, self._cadence, forecaster, self._renderer.lookahead)
+
+    def drive(self) -> Generator[Observation, Plan, None]:
+        """Yield an observation at every policy query and take the plan for it; end with the rollout.
+
+        Raises:
+            RendererError: The renderer raised, or a frame does not match its request.
+        """
+        clock, renderer, recorder, plans, state = self._clock, self._renderer, self._recorder, self._plans, self.state
+        recorder.start(clock, self._rig.specs)
+        seen = {} if self._watched else self._rig.specs
+        for tick in clock.ticks():
+            with recorder.stage("actors"):
+                self.actors = self._world.step(tick.t_us, state.ego)
+            recorder.poses(state.ego, self.actors)
+            requests = self._rig.requests(tick, state.history, self.actors)
+            with recorder.rendering(renderer, len(requests)):
+                frames = checked_frames(renderer, requests)
+            if frames and not self._watched:
+                plans.frames(tick.t_us, renderer.stage_ms)
+            for frame, request in zip(frames, requests, strict=True):
+                if frame.camera in seen:
+                    state.frames[frame.camera] = frame
+                recorder.frame(frame, request)
+            if self.path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
+                return
+            if self._cadence.queries_at(tick.t_us):
+                observation = state.observe(seen)
+                recorder.policy_query(observation, clock)
+                began = time.perf_counter()
+                with recorder.stage("policy"):
+                    plan = yield observation
+                recorder.plan_motion.add(plan, state.ego)
+                plan_world, *samples = state.to_world(plan)
+                plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
+                recorder.policy_plan(plan_world, samples)
+            before, active = state.ego, plans.active(tick.t_us)
+            with recorder.stage("control"):
+                forced = state.advance(self._controller, active, tick.t_us + clock.rates.control_us)
+            recorder.control_step(before, active, state.ego, forced)

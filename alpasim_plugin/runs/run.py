@@ -1,0 +1,328 @@
+"""A whole run: execute, tabulate, report. The same command continues an interrupted run."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+from threading import Thread
+from typing import Any, Protocol
+
+from alpasim_plugin import __version__
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.subprocesses import end_children
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.run_folder.manifests import (
+    Contents,
+    damaged_files,
+    find_contents,
+    read_contents,
+    read_manifest,
+    read_run_json,
+    write_contents,
+    write_run_json,
+)
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.schema import CONTENTS, REPORTS, RUN_INFO, SUMMARY, TABLES, slug
+from alpasim_plugin.log.run_folder.writer import write_scene, writing
+from alpasim_plugin.renderers.reconstruction_key import model_key
+from alpasim_plugin.runs.cell import find_rollout_state
+from alpasim_plugin.runs.certificate import Certify, certify, foreseen, repeating
+from alpasim_plugin.runs.commits import opened
+from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runs.executors.choice import LOCAL, Executor
+from alpasim_plugin.runs.plan import LOOP, SCORING, RunPlan
+from alpasim_plugin.runs.provenance import chosen, hardware, project, versions
+from alpasim_plugin.runs.summary import pool_of, write_summary
+from evaluators.metrics import MetricTable, table_of
+from evaluators.statistics.families import grouped
+from evaluators.statistics.verdicts import Outcome, outcome_of_failures
+from scenarios.suite import ScenarioRef
+
+SCHEMA_VERSION = 1
+
+
+class Progress(Protocol):
+    """Shows a run to a person or a log file."""
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        """Announce the run."""
+        ...
+
+    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Announce one rollout."""
+        ...
+
+    def noticed(self, text: str) -> None:
+        """Say in one line what was found damaged and what is done about it, or who is waited for."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Result of a run."""
+
+    root: Path
+    summary: dict[str, Any]
+    n_rollouts: int
+    n_failed: int
+
+    @property
+    def outcome(self) -> Outcome:
+        """Give the outcome: failures of rollouts and of their scoring. Gates add criteria to it."""
+        return outcome_of_failures(self.summary["failures"])
+
+    @property
+    def exit_code(self) -> int:
+        """Give the process exit code that docs/cli.md lists."""
+        return self.outcome.exit_code
+
+
+def on_done(progress: Progress) -> Callable[[dict[str, Any], bool], None]:
+    """Return what notes in a manifest whether its rollout was reused, and then announces it."""
+
+    def done(manifest: dict[str, Any], reused: bool) -> None:
+        manifest["reused"] = reused
+        progress.rollout_done(manifest, reused)
+
+    return done
+
+
+def default_folder(plan: RunPlan) -> Path:
+    """Return the default run folder; it depends on the command alone."""
+    first = next(iter(plan.scenarios))
+    more = f"-and-{len(plan.scenarios) - 1}-more" if len(plan.scenarios) > 1 else ""
+    return Path("runs", f"{slug(first)}{more}-{plan.command_key}")
+
+
+def execute_run(
+    plan: RunPlan,
+    root: Path,
+    workers: int | None,
+    command: Sequence[str],
+    progress: Progress,
+    resume: bool = False,
+    certificate: Certify = "one",
+    report: bool = True,
+    *,
+    wait: bool = False,
+    full: bool = False,
+    limit_s: float | None = None,
+    retry: bool = False,
+    executor: Executor = LOCAL,
+    store: str | None = None,
+) -> RunResult:
+    """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
+
+    Args:
+        plan: The run.
+        root: Its folder; one process writes it at a time.
+        workers: Worker processes; None is one per core.
+        command: The command line, for ``run.json``.
+        progress: Shows the run.
+        resume: Continue in the folder of another command.
+        certificate: Whether to repeat a rollout.
+        report: Write ``report.html``; otherwise `write_reports` makes it later.
+        wait: Wait for a process that writes the folder; otherwise refuse.
+        full: Read every file of a finished rollout before it is reused, even if size and time are as written.
+        limit_s: Seconds that one rollout may take.
+        retry: Drive again also what failed by the policy's own fault.
+        executor: Where rollouts run; the results do not depend on it.
+        store: URL of a store in which rollouts are looked up and committed, and to which the tables go.
+
+    Raises:
+        InputError: The folder holds the run of another command and ``resume`` is not set.
+        InfrastructureError: Another process writes the folder, or it is read-only and the run is not finished.
+    """
+    threads = thread_budget(workers, len(plan.cells), executor, foreseen(plan, certificate) is not None)
+    if root.exists() and not os.access(root, os.W_OK):
+        return _finished_already(plan, root)
+    with writing(root, wait, progress.noticed):
+        contents = find_contents(root)
+        held = claim(root, plan, command, threads, resume, contents, progress.noticed)
+        progress.started(plan, root, threads)
+        began = time.perf_counter()
+        how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
+        if threads.workers > 1:
+            Thread(target=_load_ending, daemon=True).start()
+        try:
+            with repeating(plan, root, certificate) as repeat:
+                known = contents.rollouts if contents else ()
+                manifests = execute(plan, root, how, on_done(progress), progress.noticed, known, repeat)
+                pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
+                determinism = certify(plan, root, manifests, how.cores_here, certificate, held.get("determinism"), repeat)
+        finally:
+            end_children()
+        summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
+        publish(root, store)
+    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+
+
+def _load_ending() -> None:
+    """Load what the tables and reports take, while workers drive."""
+    for module in ("scipy.special", "alpasim_plugin.runs.reports", "evaluators.report.terminal"):
+        import_module(module)
+
+
+def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True) -> dict[str, Any]:
+    """Write the tables, the reports and the contents of a run whose rollouts are done; return the summary.
+
+    Args:
+        root: The run folder.
+        manifests: One per rollout, in the order of the tables.
+        more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made again.
+        report: Write ``report.html``.
+    """
+    info = read_run_json(root)
+    outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
+    write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
+    baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
+    paths = {scene: str((facts.get("ref") or {}).get("path") or scene) for scene, facts in (info.get("scenes") or {}).items()}
+    summary = write_summary(root, manifests, info["preset"], baseline, more, bases, MetricTable.of_run(info), grouped(paths))
+    from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
+
+    write_reports(root, flips=info.get("kind") != "score", page=report)
+    write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
+    return summary
+
+
+def publish(root: Path, store: str | None) -> None:
+    """Copy the description, tables and reports of a finished run folder to its store, if it has one."""
+    if store is None:
+        return
+    pages = [name for name in REPORTS if (root / name).exists()]
+    opened(store).publish(root, [*read_contents(root).files, RUN_INFO, *pages, CONTENTS])
+
+
+def _finished_already(plan: RunPlan, root: Path) -> RunResult:
+    """Return the result of a finished run in a read-only folder.
+
+    Raises:
+        InfrastructureError: It is not finished, or damaged.
+    """
+    contents = find_contents(root)
+    left = [cell for cell in plan.cells if find_rollout_state(cell, root, reuse_undigested=True)[0] != "none"]
+    problems = [f"{len(left)} of {len(plan.cells)} rollouts are missing or out of date"] if left else []
+    if contents is None or contents.run.get("content") != plan.content or damaged_files(root, contents):
+        problems.append("its tables are missing or those of another run")
+    if problems:
+        found = f"it is read-only, and {' and '.join(problems)}"
+        do_this = "name another --out, or copy the folder to where it can be written"
+        raise InfrastructureError("starting a run", f"folder {root}", found, do_this)
+    summary = read_json(root / SUMMARY)
+    return RunResult(root, summary, len(plan.cells), summary["failures"]["n_failed"])
+
+
+def claim(
+    root: Path,
+    plan: RunPlan,
+    command: Sequence[str],
+    threads: Threads,
+    resume: bool,
+    contents: Contents | None,
+    noticed: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write run.json and the scene files, or check that the folder holds this run; changed parts are written again.
+
+    Returns:
+        What ``run.json`` said before; empty for a new folder.
+    """
+    held, lost = _held(root, contents, noticed)
+    if held and held.get("key") != plan.command_key and not resume:
+        raise InputError(
+            "starting a run",
+            f"folder {root}",
+            f"it holds another run (key {held.get('key')}; this command has {plan.command_key})",
+            "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
+        )
+    damage = [] if contents is None else damaged_files(root, contents)
+    for one in damage:
+        noticed(f"damaged: {one}; writing it again")
+    (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
+    if held.get("content") != plan.content:
+        write_run_info(root, plan, command, threads)
+        return held
+    if lost:
+        write_run_json(root, held)
+    if contents is None or any(one.file not in TABLES for one in damage):
+        _write_scenes(root, plan)
+    return held
+
+
+def _held(root: Path, contents: Contents | None, noticed: Callable[[str], None]) -> tuple[dict[str, Any], bool]:
+    """Return what ``run.json`` says, empty for a new folder, and whether it is lost and its copy in the contents stands for it."""
+    if contents is None and not (root / RUN_INFO).exists():
+        return {}, False
+    try:
+        return read_run_json(root), False
+    except InputError as error:
+        noticed(f"damaged: {RUN_INFO}: {error.found}; writing it again")
+        return {} if contents is None else dict(contents.run), True
+
+
+def _write_scenes(root: Path, plan: RunPlan) -> None:
+    for scenario in plan.scenarios.values():
+        write_scene(root, scenario)
+
+
+def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads) -> None:
+    """Write ``run.json`` and the scene files of the report."""
+    _write_scenes(root, plan)
+    refs = {cell.scene: cell.ref for cell in plan.cells}
+    fixed = [spec for spec in plan.renderers if spec.fixer is not None]
+    parts = plan.parts
+    write_run_json(
+        root,
+        {"schema_version": SCHEMA_VERSION, "key": plan.command_key, "content": plan.content}
+        | origin_of(command)
+        | {
+            "asked": list(plan.asked),
+            "config": asdict(plan.options) | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
+            "preset": plan.options.preset,
+            "renderers": [spec.name for spec in plan.renderers],
+            "policies": [spec.name for spec in plan.policies],
+            "seeds": list(plan.seeds),
+            "scenes": {name: _scene_facts(scenario, refs[name]) for name, scenario in plan.scenarios.items()},
+            "bases": {spec.name: spec.base.name for spec in fixed},
+            "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
+            "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
+            "code": {"loop": own_code_digest(LOOP)[:12], "scoring": own_code_digest(SCORING)[:12]},
+            "metrics": table_of(parts).as_dict(),
+            "weights": {file: sha for part in parts for file, sha in part.files.items()},
+            "hardware": hardware(),
+            "versions": versions(),
+            "left_out": sorted({note for scenario in plan.scenarios.values() for note in scenario.notes}),
+        },
+    )
+
+
+def origin_of(command: Sequence[str]) -> dict[str, Any]:
+    """Return what ``run.json`` says of how a run folder came about: command, version, time, the user's project."""
+    return {
+        "command": list(command),
+        "version": __version__,
+        "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "project": project(),
+    }
+
+
+def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> dict[str, Any]:
+    where = {"path": str(Path(ref.path).absolute()), "seed": ref.seed, "overrides": ref.overrides, "source": ref.source}
+    return {
+        "source": scenario.source,
+        "ref": where,
+        "content_hash": scenario.content_hash,
+        "seed": scenario.seed,
+        "varied": {key: list(values) for key, values in scenario.varied.items()},
+        "duration_s": (scenario.end_us - scenario.start_us) * 1e-6,
+        "rates": asdict(scenario.rates),
+        "latency": asdict(scenario.latency),
+        "degradation": asdict(scenario.degradation),
+        "reconstruction": model_key(scenario),
+        "notes": list(scenario.notes),
+    }

@@ -1,0 +1,363 @@
+"""Score rollout logs without rendering, and write the files of a run folder."""
+
+from __future__ import annotations
+
+import glob
+import re
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core.checksums import problem_of
+from alpasim_plugin.core.config import load_yaml
+from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.run_folder.manifests import read_manifest
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
+from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
+from alpasim_plugin.runs.loop_state import PathEnd
+from alpasim_plugin.runs.scoring import contacts_of, tabulate
+from evaluators import reduce_rollout, score
+from evaluators.alpasim import ScoredRollout
+from evaluators.metrics.presets import Preset
+from scenarios.load import load_scenario
+from scenarios.suite import load_suite
+from scenarios.usdz import read_usdz, usdz_scene_id
+
+DOING = "scoring logs"
+UNKNOWN = "unknown"  # renderer or policy that a log does not name
+SKIPPED = "<skip>"
+
+
+@dataclass(frozen=True)
+class LogScore:
+    """Result of one log."""
+
+    manifest: dict[str, Any]
+    scored: ScoredRollout | None  # None if the log could not be scored
+
+
+def find_logs(items: Sequence[str]) -> list[Path]:
+    """Return the logs of files, folders (searched to any depth for ``*.asl``) and glob patterns, each once, sorted per item.
+
+    Raises:
+        InputError: An item names no log.
+    """
+    found: dict[Path, Path] = {}
+    for item in items:
+        path = Path(item)
+        paths = [path] if path.is_file() else sorted(path.rglob("*.asl")) if path.is_dir() else []
+        if not paths and glob.has_magic(item):
+            hits = [Path(hit) for hit in sorted(glob.glob(item, recursive=True))]
+            paths = [log for hit in hits for log in ([hit] if hit.is_file() else sorted(hit.rglob("*.asl")))]
+        if not paths:
+            what = "a folder without .asl logs" if path.is_dir() else "no such file, folder or match"
+            raise InputError("finding logs", item, what, "give rollout.asl files, folders that hold them, or a pattern in quotes")
+        for log in paths:
+            found.setdefault(log.resolve(), log)
+    return list(found.values())
+
+
+def score_logs(
+    logs: Sequence[Path],
+    scenes: KnownScenes,
+    preset: Preset,
+    evaluators: Sequence[PartSpec],
+    root: Path,
+    on_done: Callable[[dict[str, Any]], None],
+) -> list[LogScore]:
+    """Score every log against its scene and write its steps.
+
+    A log that cannot be read, is incomplete or cannot be scored becomes a failed row; the others are still scored.
+
+    Raises:
+        InputError: A log of a scene that is not among the given ones, or a scene that cannot be read.
+    """
+    out: list[LogScore] = []
+    taken: set[str] = set()
+    names: set[str] = set()
+    for log in logs:
+        began = time.perf_counter()
+        one = _score(log, scenes, preset, evaluators, root, taken, names)
+        one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
+        out.append(one)
+        on_done(one.manifest)
+    return out
+
+
+def _score(
+    log: Path,
+    scenes: KnownScenes,
+    preset: Preset,
+    evaluators: Sequence[PartSpec],
+    root: Path,
+    taken: set[str],
+    names: set[str],
+) -> LogScore:
+    name = log.resolve().parent.name
+    manifest: dict[str, Any] = {
+        "renderer": UNKNOWN, "policy": UNKNOWN, "scene": UNKNOWN, "seed": 0, "rollout": name, "log": str(log), "preset": preset.name,
+        "reused": True,  # nothing was rendered, so these rows have no speed
+    }  # fmt: skip
+    try:
+        check_vouched(log)
+        rollout = read_asl(log)
+    except InputError as error:
+        return _failed(manifest, error, root, taken)
+    session = rollout.session_uuid or name  # as in AlpaSim; a second log with that id gets its folder's name with it
+    session = session if session not in names else f"{session} ({name})"
+    names.add(session)
+    versions = rollout.info["versions"]
+    manifest |= {
+        "renderer": _named(versions.get("sensorsim"), versions.get("video_model")),
+        "policy": _named(versions.get("egodriver")),
+        "scene": rollout.scene_id,
+        "seed": int(rollout.seed) & (2**63 - 1),
+        "rollout": session,
+        "session_uuid": rollout.session_uuid,
+        "frames": len(rollout.images),
+        "steps": _steps(rollout),
+        "warnings": list(rollout.warnings),
+    }
+    known = scenes.of(rollout.scene_id)  # a wrong --scene is an error of the command, not of the log
+    try:
+        check_complete(log, rollout)
+        series = tuple(score(rollout, known.scene, preset, evaluators))
+        one = tabulate(rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset))
+    except SimrunError as error:
+        return _failed(manifest, error, root, taken)
+    manifest |= {"status": "ok", "metrics": one.metrics, "events": one.events, "censored": one.censored}
+    manifest |= {"contacts": one.contacts, "path": _folder(manifest, taken)}
+    keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
+    write_steps(root / manifest["path"], [keys | row for row in one.steps], of_logs=True)
+    run_uuid, run_name = run_names(log)
+    return LogScore(manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name))
+
+
+def check_vouched(log: Path) -> None:
+    """Refuse a log of a run folder that is not the one its manifest vouches for; logs without a manifest beside them pass.
+
+    Raises:
+        InputError: The log is damaged, or another one.
+    """
+    if log.name != LOG_NAME or not (log.parent / MANIFEST).exists():
+        return
+    try:
+        facts = read_manifest(log.parent)[0]["files"].get(LOG_NAME)
+        problem = None if facts is None else problem_of(log, facts, full=True)
+    except InputError as error:
+        problem = f"its {MANIFEST} is damaged: {error.found}"
+    if problem is not None:
+        run = next((folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None)
+        do_this = "run the rollout again" if run is None else f"simrun check {run} --repair runs it again"
+        raise InputError("reading a rollout log", str(log), problem, do_this)
+
+
+def check_complete(log: Path, rollout: RolloutLog) -> None:
+    """Refuse the log of a rollout that did not finish.
+
+    A finished rollout has the number of control steps in its header after the first policy time, or covers the recording. A rollout that
+    the driver terminated is finished, and one whose last pose is the first beyond the end of the recorded path: ours end there.
+
+    Raises:
+        InfrastructureError: The log ends earlier.
+    """
+    if rollout.info["terminated"] or rollout.control_us <= 0 or len(rollout.ego) < 2:
+        return
+    recorded = (int(rollout.ego_log.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
+    steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
+    done = _steps(rollout)
+    if done < steps and not _ends_with_the_path(rollout):
+        cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
+        raise InfrastructureError(
+            "scoring a log", str(log), f"the rollout ended after {done} of {steps} control steps{cut}",
+            "run this rollout again",
+        )  # fmt: skip
+
+
+def _ends_with_the_path(rollout: RolloutLog) -> bool:
+    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    end = PathEnd(rollout.ego_log)
+    passed = [end.ends_rollout(at) for at in rig.xyz[1:, :2]]
+    return passed[-1] and not any(passed[:-1])
+
+
+def _steps(rollout: RolloutLog) -> int:
+    """Return how many control steps were driven: since the first policy time, which is the second logged pose."""
+    if len(rollout.ego) < 2 or rollout.control_us <= 0:
+        return 0
+    return (int(rollout.ego.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
+
+
+def run_names(log: Path) -> tuple[str | None, str | None]:
+    """Return uuid and name of the run that a log belongs to, of the ``run_metadata.yaml`` in the nearest folder above it.
+
+    Raises:
+        InputError: The file is invalid.
+    """
+    for folder in list(log.resolve().parents)[:5]:
+        path = folder / "run_metadata.yaml"
+        if path.is_file():
+            data = load_yaml(path, "reading the names of a run").data
+            uuid, name = (data.get(key) if isinstance(data, dict) else None for key in ("run_uuid", "run_name"))
+            return None if uuid is None else str(uuid), None if name is None else str(name)
+    return None, None
+
+
+def _failed(manifest: dict[str, Any], error: SimrunError, root: Path, taken: set[str]) -> LogScore:
+    manifest |= {"status": "failed", "error": error.as_dict(), "path": _folder(manifest, taken)}
+    return LogScore(manifest, None)
+
+
+def _folder(manifest: dict[str, Any], taken: set[str]) -> str:
+    """Return the folder of a log's results, relative to the run folder; logs with the same names get numbers."""
+    base = rollout_folder(*(str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout"))).as_posix()
+    path, n = base, 2
+    while path in taken:
+        path, n = f"{base}-{n}", n + 1
+    taken.add(path)
+    return path
+
+
+def _named(*versions: str | None) -> str:
+    return next((text for text in versions if text and text != SKIPPED), UNKNOWN)
+
+
+def exit_code(scores: Sequence[LogScore], failures_allowed: bool, aggregate_error: EvaluatorError | None) -> int:
+    """Return the process exit code: 2 for a log that cannot be read, 5 for one that cannot be scored, 4 for a rollout cut short."""
+    classes = {one.manifest["error"]["failure_class"] for one in scores if one.manifest["status"] != "ok"}
+    if "input" in classes:
+        return 2
+    if "evaluator" in classes or aggregate_error is not None:
+        return 5
+    return 4 if classes and not failures_allowed else 0
+
+
+FINDING = "finding the scene of a log"
+_SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")  # a seed other than the file's is part of the id
+MOST_SEEDED = 256
+
+
+class KnownScenes:
+    """Finds scenes in files and folders; each is read once, on first use.
+
+    Args:
+        places: Scenes (anything that ``simrun run`` drives), or folders of them.
+        rails: Whether lanes of AlpaSim scenes keep their rails.
+
+    Raises:
+        InputError: A place without scenes, or two AlpaSim scenes with one id.
+    """
+
+    def __init__(self, places: Sequence[str | Path], rails: bool = True) -> None:
+        self.places, self._rails = [str(place) for place in places], rails
+        self._archives: dict[str, Path] = {}
+        self._others: list[str] = []
+        self._read: dict[str, LoggedScene] = {}
+        self._own: dict[str, str] = {}  # file -> id of its scene
+        self._seeded: list[str] = []  # of other seeds, oldest first: whoever asks may name any number of them
+        for place in self.places:
+            for path in _scene_files(place):
+                if Path(path).suffix == ".usdz":
+                    self._add_archive(Path(path))
+                else:
+                    self._others.append(path)
+
+    def of(self, scene_id: str) -> LoggedScene:
+        """Return the scene with an id.
+
+        Raises:
+            InputError: None of the places has it, or it cannot be read.
+        """
+        if scene_id not in self._read and scene_id in self._archives:
+            self._read[scene_id] = _from_archive(self._archives[scene_id], self._rails)
+        elif scene_id not in self._read:
+            self._search(scene_id)
+        if scene_id not in self._read:
+            known = sorted({*self._archives, *self._read})
+            raise InputError(
+                FINDING, f"scene {scene_id!r}", f"not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
+                "name the log's scene with --scene, or a folder that holds it",
+            )  # fmt: skip
+        return self._read[scene_id]
+
+    def _search(self, scene_id: str) -> None:
+        """Read scenario files until one has the id, or the id of another seed of it."""
+        seeded = _SEEDED.fullmatch(scene_id)
+        for path in self._others:
+            if path not in self._own:
+                found = _from_scenario(load_scenario(path))
+                self._own[path] = found.scene.scene_id
+                self._read[found.scene.scene_id] = found
+            if seeded and self._own[path] == seeded["own"]:
+                found = _from_scenario(load_scenario(path, int(seeded["seed"])))
+                if found.scene.scene_id not in self._read:  # seed007 and seed7 are one scene
+                    self._seeded.append(found.scene.scene_id)
+                self._read[found.scene.scene_id] = found
+            if scene_id in self._read:
+                break
+        while len(self._seeded) > MOST_SEEDED:
+            del self._read[self._seeded.pop(0)]
+
+    def _add_archive(self, path: Path) -> None:
+        scene_id = usdz_scene_id(path)
+        before = self._archives.get(scene_id)
+        if before is not None and before.resolve() != path.resolve():
+            raise InputError(FINDING, f"{before} and {path}", f"both have the id {scene_id!r}", "remove one of them")
+        self._archives[scene_id] = path
+
+
+def _scene_files(place: str) -> list[str]:
+    """Return the scene files of a path, a folder or a shipped name."""
+    path = Path(place)
+    archives = sorted(path.rglob("*.usdz")) if path.is_dir() else []
+    if archives:
+        return [str(one) for one in archives]
+    return [ref.path for ref in load_suite(place)]
+
+
+def _from_archive(path: Path, rails: bool) -> LoggedScene:
+    record = read_usdz(path, rails, needs_map=False)
+    scene = Scene(record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map)
+    return LoggedScene(scene, record.source, record.content_hash, record.notes, record.actors, record.world_origin)
+
+
+def _from_scenario(one: Scenario) -> LoggedScene:
+    return LoggedScene(
+        one.scene, one.source, one.content_hash, one.notes, one.actors, one.world_origin, one.start_us, one.end_us, one.warmup_us
+    )
+
+
+def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
+    """Return what finds a scenario by its scene id among files, folders and shipped names.
+
+    Without places, and only then, every id gets a straight road, of which nothing is true but the id: a policy under test takes no more
+    from its scenario than cameras and vehicle.
+
+    Raises (when called):
+        InputError: None of the places has the id.
+    """
+    if not places:
+        blank = load_scenario("smoke/straight")
+        return lambda scene_id: replace(blank, scene_id=scene_id, actors=())
+    paths = [path for place in places for path in _scene_files(place)]
+    found: dict[str, Scenario] = {}
+    reading = threading.Lock()  # sessions open at the same time
+
+    def find(scene_id: str) -> Scenario:
+        with reading:
+            while scene_id not in found and paths:
+                scenario = load_scenario(paths.pop(0))
+                found[scenario.scene_id] = scenario
+        if scene_id not in found:
+            shown = ", ".join(sorted(found)[:5])
+            raise InputError(FINDING, f"scene {scene_id!r}", f"not among the {len(found)} scenes given: {shown}", "name it with --scenes")
+        return found[scene_id]
+
+    return find

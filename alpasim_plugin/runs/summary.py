@@ -1,0 +1,239 @@
+"""``summary.json`` of a run folder, and of several as one: numbers, failures and times, made from manifests and tables."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
+from alpasim_plugin.log.run_folder.columns import AGAIN, DOING, RolloutTable
+from alpasim_plugin.log.run_folder.manifests import damaged_files, find_contents, read_run_json
+from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
+from alpasim_plugin.log.run_folder.writer import write_tables
+from alpasim_plugin.runs.execute import Threads
+from alpasim_plugin.runs.provenance import fixers
+from alpasim_plugin.runs.recorder import plan_table
+from evaluators import censoring
+from evaluators.metrics import METRICS, MetricTable
+from evaluators.statistics.arms import arms_of, base_named
+from evaluators.statistics.outcomes import outcome_table, rollouts_of
+from evaluators.statistics.summary import NO_BASES, by_policy, numbers
+
+
+def write_summary(
+    root: Path,
+    manifests: Sequence[dict[str, Any]],
+    preset: str,
+    baseline: str | None,
+    more: Mapping[str, Any],
+    bases: Mapping[str, str] = NO_BASES,
+    known: MetricTable = METRICS,
+    family_of: Mapping[str, str] = NO_BASES,
+) -> dict[str, Any]:
+    """Write the tables and ``summary.json`` of a run folder and return the summary.
+
+    Args:
+        root: The run folder; the manifests' rollouts are below it.
+        manifests: One per rollout, in the order of the tables.
+        preset: Evaluator preset of the scores.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the first.
+        more: What the manifests do not tell, for the summary.
+        bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
+            baseline, the two are paired too.
+        known: What the metrics are.
+        family_of: SCENE -> its family.
+    """
+    rollouts = write_tables(root, manifests)
+    done = [m for m in manifests if m["status"] == "ok"]
+    summary = {
+        "preset": preset,
+        "outcomes": outcome_table(*rollouts_of(manifests)),
+        **numbers(RolloutTable.of_table(rollouts), baseline, bases, known, family_of),
+        "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
+        "failures": _failures(manifests),
+        "fixers": by_policy(_of_policies(done), fixers),
+        "plans": by_policy(_of_policies(done), plan_table),
+        "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
+        **more,
+    }
+    write_json(root / SUMMARY, summary)
+    return summary
+
+
+def _of_policies(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    found: dict[str, list[dict[str, Any]]] = {}
+    for manifest in manifests:
+        found.setdefault(manifest["policy"], []).append(manifest)
+    return found
+
+
+def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    renderers = list(dict.fromkeys(m["renderer"] for m in manifests))
+    return {name: speed([m for m in manifests if m["renderer"] == name]) for name in renderers}
+
+
+def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
+
+    A frame's time is the sum of all stages of the loop between two frames; the time of a block is divided evenly among its frames.
+    The frames of each rollout's first call are kept apart: that call may compile or fill caches.
+    """
+    stages: dict[str, list[float]] = {}
+    first, per_frame = [], []
+    for manifest in manifests:
+        frames, opening = max(int(manifest["frames"]), 1), max(int(manifest.get("first_call_frames", 1)), 1)
+        total = np.zeros(frames)
+        for stage, durations in manifest["stage_ms"].items():
+            total += resample_durations(durations, frames)
+            stages.setdefault(stage, []).extend(durations[opening if len(durations) == frames else 1 :])
+        first.append(float(total[:opening].sum()))
+        per_frame.extend(total[opening:].tolist())
+    if not per_frame:
+        nothing = dict.fromkeys(("ms_per_frame_p50", "ms_per_frame_p95", "ms_per_frame_mean", "frames_per_s", "first_frame_ms"))
+        return nothing | {"stages": {}}
+    all_ms = sum(sum(d) for d in stages.values())
+    return {
+        "ms_per_frame_p50": round(float(np.percentile(per_frame, 50)), 3),
+        "ms_per_frame_p95": round(float(np.percentile(per_frame, 95)), 3),
+        "ms_per_frame_mean": round(float(np.mean(per_frame)), 3),
+        "frames_per_s": round(1e3 / float(np.mean(per_frame)), 2),
+        "first_frame_ms": round(float(np.median(first)), 3),
+        "stages": {name: _stage(d, all_ms, len(per_frame)) for name, d in stages.items() if any(d)},
+    }
+
+
+def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, float]:
+    """Return percentiles of the passes that took place (a frame from a draft has none through the fixer), share and mean per frame."""
+    passes, total = [d for d in durations if d > 0.0], sum(durations)
+    return {
+        "p50_ms": round(float(np.percentile(passes, 50)), 3),
+        "p95_ms": round(float(np.percentile(passes, 95)), 3),
+        "share": round(total / all_ms, 4),
+        "per_frame_ms": round(total / frames, 3),
+    }
+
+
+def resample_durations(durations: Sequence[float], frames: int) -> F64:
+    """Distribute the durations of a stage over frames, evenly and in order; the sum is kept.
+
+    Example:
+        >>> resample_durations([2.0, 4.0], 4), resample_durations([1.0, 1.0, 3.0, 3.0], 2)
+        (array([1., 1., 2., 2.]), array([2., 6.]))
+    """
+    done = np.concatenate([[0.0], np.cumsum(durations)])
+    return np.diff(np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done))
+
+
+def pool_of(manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """Return the throughput of all workers together, start-up included; a run that only reused rollouts keeps its earlier figures."""
+    fresh = [m for m in manifests if not m.get("reused")]
+    if not fresh and before:
+        return before
+    frames = sum(int(m.get("frames") or 0) for m in fresh)
+    return {
+        "workers": threads.workers,
+        "threads_per_worker": threads.per_worker,
+        "wall_s": round(wall_s, 3),
+        "frames": frames,
+        "frames_per_s_total": round(frames / wall_s, 2) if frames and wall_s > 0 else None,
+    }
+
+
+def _failures(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    failed = [m for m in manifests if m["status"] != "ok"]
+    by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
+    cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
+    return {"n_failed": len(failed), "n_rollouts": len(manifests), "by_class": by_class, "cells": cells}
+
+
+def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[str, Any]:
+    """Return the numbers of all rollouts of some runs, such as the parts of a night, in the form of ``summary.json``.
+
+    A cell (renderer, policy, scene, seed) that several runs hold counts once, with the mean of its repeats, as in a single run.
+
+    Args:
+        runs: Finished run folders.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the first run's.
+
+    Returns:
+        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_arms``, ``failures`` (docs/statistics.md).
+
+    Raises:
+        InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a metric is another one in another run; a
+            folder
+            is named twice; no run has the baseline.
+    """
+    twice = [run for i, run in enumerate(runs) if run.resolve() in {other.resolve() for other in runs[:i]}]
+    if twice:
+        raise InputError(DOING, str(twice[0]), "named twice", "name every run once")
+    infos = {run: _info_of(run) for run in runs}
+    _check_alike(infos)
+    first = next(iter(infos.values()))
+    table = RolloutTable.of_files([run / ROLLOUTS for run in runs])
+    arms = arms_of((name, policy) for policy in table.policies for name in table.sides(policy))
+    if baseline is not None:
+        base_named(baseline, arms, DOING, "the runs together")
+    known = _joined(infos, table.metrics)
+    bases = {name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()}
+    by_class = table.failures()
+    return {
+        "runs": [str(run) for run in runs],
+        "preset": first["preset"],
+        **numbers(table, baseline or first["config"].get("baseline"), bases, known),
+        "failures": {"n_failed": sum(by_class.values()), "n_rollouts": table.n_rollouts, "by_class": by_class},
+    }
+
+
+def joined_metrics(runs: Sequence[Path]) -> MetricTable:
+    """Return what the metrics of some runs are."""
+    return _joined({run: read_run_json(run) for run in runs}, ())
+
+
+def _joined(infos: Mapping[Path, Mapping[str, Any]], metrics: Sequence[str]) -> MetricTable:
+    first, *others = infos.items()
+    known = MetricTable.of_run(first[1])
+    for run, info in others:
+        known = known.joined(MetricTable.of_run(info), metrics, DOING, f"{first[0]} and {run}")
+    return known
+
+
+def _info_of(run: Path) -> dict[str, Any]:
+    """Return a run's description.
+
+    Raises:
+        InputError: The run is not finished, or damaged.
+    """
+    info = read_run_json(run)
+    contents = find_contents(run)
+    damaged = None if contents is None else next((one for one in damaged_files(run, contents) if one.file == ROLLOUTS), None)
+    if contents is None or damaged is not None:
+        raise InputError(DOING, str(run), "the run is not finished" if damaged is None else str(damaged), AGAIN)
+    ROLLOUTS_TABLE.check(run / ROLLOUTS, DOING, AGAIN, MetricTable.of_run(info).rates)
+    return info
+
+
+def _check_alike(infos: Mapping[Path, Mapping[str, Any]]) -> None:
+    """Refuse runs whose rollouts are not of one kind.
+
+    Raises:
+        InputError: Presets differ, or a scene's content does.
+    """
+    seen: dict[str, tuple[str, Path]] = {}
+    first, kind = next((run, info["preset"]) for run, info in infos.items())
+    for run, info in infos.items():
+        if info["preset"] != kind:
+            found = f"presets {kind!r} and {info['preset']!r}"
+            raise InputError(DOING, f"{first} and {run}", found, "give the command of one run again with --preset")
+        for scene, facts in info["scenes"].items():
+            content = str(facts.get("content_hash") or "")
+            other, where = seen.setdefault(scene, (content, run))
+            if other != content:
+                raise InputError(
+                    DOING, f"{where} and {run}", f"scene {scene} with another content", "aggregate runs of the same scene files"
+                )

@@ -1,0 +1,363 @@
+"""The page of one drive's cause, offline: what the policy saw, planned and said of itself, what was tried, what to ask next."""
+
+from __future__ import annotations
+
+import base64
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from markupsafe import Markup
+
+from alpasim_plugin.core.atomic import write_text
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
+from alpasim_plugin.core.types import F64, I64, U8, RolloutLog
+from alpasim_plugin.log import decode_image
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
+from evaluators.metrics.outcomes import first_failure, in_words, outcomes_of
+from evaluators.opening import Run
+from evaluators.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_log, read_logs
+from evaluators.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
+from evaluators.viewer.page import as_json, fill
+from evaluators.viewer.pictures import frame_rows, jpeg, seen_before, smaller
+
+DOING = "writing the page of a cause"
+WIDTH_PX = 640
+JPEG_START = b"\xff\xd8"
+BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
+MOST_LOOKS = 48
+CROP_SHARE = 3  # the crop is a third as wide and as high as the picture
+SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
+STYLES = ("theme.css", "report.css", "cause.css")
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Look:
+    """One query of the policy.
+
+    Attributes:
+        T_world_rig: ``(4, 4)``: where the ego was.
+        speed_mps: Along the rig.
+        route: ``(N, 2)`` metres, rig frame, as it was given; empty where that is not known.
+        plans: Behind each renderer at that pose: the plan and its samples, each ``(N, 2)`` metres, rig frame, every half second.
+        frames: What each renderer showed of the first camera: time, and ``(H, W, 3)`` or its JPEG.
+        debug: What the policy said of itself, `Plan.debug`.
+    """
+
+    t_us: int
+    T_world_rig: F64
+    speed_mps: float
+    route: F64
+    plans: Mapping[str, Sequence[F64]]
+    frames: Mapping[str, tuple[int, U8 | bytes]]
+    debug: Mapping[str, Any]
+
+
+def half_seconds(times_us: I64, xy: F64) -> F64:
+    """Return positions ``(T, 2+)`` every half second ``(N, 2)``, on which the page counts."""
+    at = np.arange(times_us[0], times_us[-1] + 1, PLAN_STEP_US)
+    return np.stack([np.interp(at, times_us, xy[:, k]) for k in (0, 1)], axis=1)
+
+
+@dataclass(frozen=True)
+class Parting:
+    """When plans part from those behind another renderer, or of another policy.
+
+    Attributes:
+        name: The renderer or the policy.
+        kind: ``renderer`` or ``policy``.
+        t_us: The first query at which they are apart; None: never.
+        gap_m: How far apart they are then, or at most.
+        frames: The other's picture and the own one at that query, ``(H, W, 3)`` each; none of a policy, which sees the same.
+    """
+
+    name: str
+    kind: str
+    t_us: int | None
+    gap_m: float
+    frames: tuple[U8, U8] | None = None
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What is known of how a drive ended.
+
+    Attributes:
+        outcome: In words.
+        failed_us: When it failed first; None where it did not.
+        start_us: The first camera frame.
+        sentences: What was found, the surest first: how sure ("shown", "seen", "not found"), and what.
+        looks: Queries to show, in order of time.
+        tried: A row a change: what was changed, how far plans are from the recorded drive with it, how the drive ends with it.
+        depends: A row an input: what was done to it, whether the plans changed, by how much.
+        partings: When plans part from others'.
+        commands: What can be asked next: a key, what it shows, the command.
+        notes: What is missing, a sentence each.
+    """
+
+    rollout: Rollout
+    outcome: str
+    failed_us: int | None
+    start_us: int
+    sentences: Sequence[tuple[str, str]]
+    looks: Sequence[Look]
+    tried: Sequence[tuple[str, str, str]]
+    depends: Sequence[tuple[str, str, str]]
+    partings: Sequence[Parting]
+    commands: Sequence[tuple[str, str, str]]
+    notes: Sequence[str] = ()
+
+
+def write_cause(run: Run, cause: Cause) -> Path:
+    """Write the page into the folder of the rollout and return its path.
+
+    Raises:
+        InputError: The run has no map of the scene.
+        InfrastructureError: The disk refuses.
+    """
+    rollout = cause.rollout
+    path = run.folder / rollout.path / WHY_NAME
+    report = "../" * len(Path(rollout.path).parts) + "report.html"
+    cell = cells_of(run, Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,)))[0]
+    logs = read_logs(run, cell)
+    document = cell_data(run, cell, logs, None)
+    place = Place(np.array(document.pop("origin")), document.pop("zero_us"))
+    document |= {"failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0], "own": rollout.renderer}
+    log = next(iter(logs.values()))
+    camera = next(iter(log.info["cameras"]), None) if isinstance(log, RolloutLog) else None
+    scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
+    document |= {"looks": [_look(look, place, scale) for look in cause.looks]}
+    document["lens"] = None if camera is None else lens_data(camera, WIDTH_PX)
+    html = fill(
+        "cause.html.j2",
+        SCRIPTS,
+        STYLES,
+        cause=cause,
+        document=Markup(as_json(document)),
+        partings=[_parting(one, cause.start_us) for one in cause.partings],
+        run=run.folder.resolve().name,
+        report=report,
+        failed_s=None if cause.failed_us is None else (cause.failed_us - cause.start_us) * 1e-6,
+    )
+    write_text(path, html, DOING)
+    return path
+
+
+def _look(look: Look, place: Place, scale: float) -> dict[str, Any]:
+    """Return a query for the page: times in milliseconds, lines in world centimetres, pictures as JPEG."""
+
+    def line(xy: F64) -> list[list[int]]:
+        """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
+        known = xy[np.isfinite(xy).all(axis=1)]
+        return place.cm(transform_points(look.T_world_rig, np.column_stack([known[:, :2], np.zeros(len(known))]))[:, :2])
+
+    def picture(frame: U8 | bytes) -> str:
+        if isinstance(frame, bytes) and scale == 1.0 and frame.startswith(JPEG_START):
+            return base64.b64encode(frame).decode()
+        return jpeg(smaller(decode_image(frame, "a camera frame") if isinstance(frame, bytes) else frame, WIDTH_PX))
+
+    return {
+        "t": place.ms([look.t_us])[0],
+        "speed": round(look.speed_mps, 2),
+        "route": line(look.route),
+        "plans": {name: {"lines": [line(one) for one in lines]} for name, lines in look.plans.items()},
+        "seen": {name: {"jpeg": picture(frame), "t": place.ms([t_us])[0]} for name, (t_us, frame) in look.frames.items()},
+        "said": said(look.debug, scale, line),
+    }
+
+
+def said(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
+    """Sort what a policy says of itself in ``Plan.debug`` by what it can be shown as.
+
+    Args:
+        debug: By name. Pictures are ``(H, W, 3)`` uint8; heat maps ``(H, W)`` numbers, over the first camera's picture; ``boxes...`` are
+            ``(N, 4)`` pixels of it, x0 y0 x1 y1; ``line...`` are ``(N, 2)`` metres, rig frame. Numbers, words and short lists are text;
+            anything else is named with its type.
+        scale: Of the page's picture against the camera's.
+        line: Brings rig coordinates into the page's.
+    """
+    out: dict[str, Any] = {"text": [], "images": [], "heat": [], "boxes": [], "lines": []}
+    for name, value in debug.items():
+        array = np.asarray(value) if isinstance(value, (np.ndarray, list, tuple)) else None
+        numeric = array is not None and array.dtype.kind in "fiub" and array.size > 0
+        if numeric and array is not None:
+            if array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3:
+                out["images"].append([str(name), jpeg(smaller(array, WIDTH_PX))])
+                continue
+            if name.startswith("boxes") and array.ndim == 2 and array.shape[1] == 4:
+                out["boxes"] += [[str(name), *(round(float(v) * scale, 1) for v in row)] for row in array]
+                continue
+            if name.startswith("line") and array.ndim == 2 and array.shape[1] >= 2:
+                out["lines"].append([str(name), line(array[:, :2].astype(np.float64))])
+                continue
+            if array.ndim == 2 and min(array.shape) >= 4 and np.isfinite(array).any():
+                out["heat"].append([str(name), heat_png(array), *(f"{v:.3g}" for v in (np.nanmin(array), np.nanmax(array)))])
+                continue
+        out["text"].append([str(name), _words(value, array)])
+    return out
+
+
+def _words(value: Any, array: npt.NDArray[Any] | None) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if value is None or isinstance(value, (str, int, bool, np.generic)):
+        return str(value)[:300]
+    if array is not None and array.dtype.kind in "fiubU" and array.size <= 12:
+        return np.array2string(array, precision=3, separator=", ")
+    return f"not shown: {type(value).__name__}" + ("" if array is None else f" of shape {array.shape}")
+
+
+def heat_png(values: npt.NDArray[Any]) -> str:
+    """Return a heat map as PNG in base64: yellow where values are high, clear where they are low or missing."""
+    known = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
+    low, high = np.nanmin(known), np.nanmax(known)
+    share = np.nan_to_num((known - low) / (high - low) if high > low else known * 0.0)
+    bgra = np.stack([40 * np.ones_like(share), 60 + 170 * share, 250 * np.ones_like(share), 200 * share], axis=2)
+    done, png = cv2.imencode(".png", bgra.astype(np.uint8))
+    if not done:
+        raise InputError(DOING, f"heat map {values.shape}", "the encoder refused", "give a smaller one")
+    return base64.b64encode(png.tobytes()).decode()
+
+
+# --- from a log alone -----------------------------------------------------------------------------------------------
+
+
+def failed_at(manifest: Mapping[str, Any]) -> int | None:
+    """Return when a drive failed first, microseconds; None where it did not."""
+    first = first_failure(manifest)
+    return None if first is None else int(first["t_us"])
+
+
+def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:
+    """Return at most `MOST_LOOKS` of what has these times: what lies before the failure, or an even choice."""
+    near = [one for one, t in zip(all_of, times_us, strict=True) if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US]
+    return near[::-1][:: -(-len(near) // MOST_LOOKS) or 1][::-1]
+
+
+def looks_of(log: RolloutLog, renderer: str, failed_us: int | None) -> list[Look]:
+    """Return the queries of a log that the page shows, with what the log holds of them."""
+    camera = next(iter(log.info["cameras"]), None)
+    images = [image for image in log.images if camera is not None and image.camera == camera.name]
+    ends, found = np.array([image.end_us for image in images]), []
+    moved = np.hypot(*np.gradient(log.ego.xyz[:, :2], (log.ego.t_us - log.ego.t_us[0]) * 1e-6, axis=0).T)
+    plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
+    for plan in chosen(plans, failed_us, [one.now_us for one in plans]):
+        pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
+        lines = [half_seconds(one.t_us, transform_points(inverse(pose), one.xyz)) for one in (plan.trajectory, *plan.samples[:MAX_SAMPLES])]
+        newest = int(np.searchsorted(ends, plan.now_us, "right")) - 1
+        seen = {renderer: (images[newest].end_us, images[newest].data)} if newest >= 0 else {}
+        speed = float(np.interp(plan.now_us, log.ego.t_us, moved))
+        found.append(Look(plan.now_us, pose, speed, np.zeros((0, 2)), {renderer: lines}, seen, {}))
+    return found
+
+
+def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) -> Cause | None:
+    """Return what the files of a run say of how a drive failed; None without a log.
+
+    Args:
+        run: The run.
+        rollout: One that ended with an event.
+        told: Entries of ``flips.json`` about it: when its plans part from those of others.
+    """
+    path = run.file_of(rollout, LOG_NAME)
+    if path is None:
+        return None
+    log, failed_us = read_log(path), failed_at(run.manifest(rollout))
+    partings = []
+    for entry in told:
+        kind = "renderer" if entry["baseline"] != rollout.renderer else "policy"
+        name = str(entry["baseline"]) if kind == "renderer" else str(entry["against"]).removeprefix(rollout.renderer + "/")
+        files = [run.folder / one for one in (entry.get("frames") or {}).values()]
+        frames = [decode_image(file.read_bytes(), str(file)) for file in files if kind == "renderer" and file.is_file()]
+        pair = (frames[0], frames[1]) if len(frames) == 2 and frames[0].shape == frames[1].shape else None
+        if entry.get("t_us") is not None:
+            partings.append(Parting(name, kind, int(entry["t_us"]), float(entry["gap_m"]), pair))
+    return Cause(
+        rollout=rollout,
+        outcome=in_words(outcomes_of(rollout)),
+        failed_us=failed_us,
+        start_us=log.render_start_us,
+        sentences=[
+            *behind_others(run, rollout),
+            *(sentence(one, log.render_start_us) for one in partings),
+            *_seen_before(run, rollout, failed_us),
+        ],
+        looks=looks_of(log, rollout.renderer, failed_us),
+        tried=[],
+        depends=[],
+        partings=partings,
+        commands=commands(run, rollout, log.render_start_us, failed_us, partings),
+    )
+
+
+def behind_others(run: Run, rollout: Rollout) -> list[tuple[str, str]]:
+    """Say behind which renderers of the run the same drive ends without an event: what they show differently is then what made it fail."""
+    same = [r for r in run.rollouts if (r.policy, r.scene, r.seed) == (rollout.policy, rollout.scene, rollout.seed)]
+    better = [r.renderer for r in same if r.ok and not outcomes_of(r)]
+    if not better or not outcomes_of(rollout):
+        return []
+    told = f"Behind {' and '.join(better)} the same drive ends without an event"
+    return [("shown", f"{told}: the pictures of {rollout.renderer} make the difference.")]
+
+
+def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[tuple[str, str]]:
+    text = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
+    return [("seen", f"{text}.")] if text else []
+
+
+def sentence(one: Parting, start_us: int) -> tuple[str, str]:
+    """Say when plans part, and how sure that is."""
+    if one.t_us is None:
+        return "seen", f"Plans never part from those of the {one.kind} {one.name}: they are the same within {one.gap_m:.2f} m."
+    at_s = (one.t_us - start_us) * 1e-6
+    return "seen", f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m."
+
+
+def commands(run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]) -> list[tuple[str, str, str]]:
+    """Return what can be asked next: a key, what it shows, the command."""
+    root, name = shlex.quote(str(run.folder)), shlex.quote(cell_name(*rollout.cell))
+    parted = next((one.t_us for one in partings if one.t_us is not None), failed_us or start_us)
+    own, at = rollout.renderer, max(0.0, (parted - start_us) * 1e-6)
+    other = next((one.name for one in partings if one.kind == "renderer"), "clean" if own != "clean" else "3dgs")
+    return [
+        ("w", "try single changes of what the policy sees and answers", f"simrun why {shlex.quote(str(run.folder / rollout.path))}"),
+        ("f", f"drive on from there behind {other}", f"simrun fork {root} --cell {name} --at {at:.1f} --renderer {other}"),
+        ("p", "compare plans at the same poses", f"simrun probe {root} --cell {name} --renderers {other},{own}"),
+        ("v", "watch the drive", f"simrun view {shlex.quote(str(run.folder / rollout.path))}"),
+    ]
+
+
+# --- where plans part -----------------------------------------------------------------------------------------------
+
+
+def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
+    """Return the part of two pictures that differs most: x, y, width and height in pixels."""
+    height, width = one.shape[:2]
+    size = (max(1, width // CROP_SHARE), max(1, height // CROP_SHARE))
+    apart = np.abs(one.astype(np.float32) - other.astype(np.float32)).mean(axis=2)
+    mean = cv2.blur(apart, size, borderType=cv2.BORDER_REPLICATE)
+    inside = mean[size[1] // 2 : height - size[1] // 2, size[0] // 2 : width - size[0] // 2]
+    y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return int(x), int(y), *size
+
+
+def _parting(one: Parting, start_us: int) -> dict[str, Any]:
+    at = None if one.t_us is None else (one.t_us - start_us) * 1e-6
+    entry: dict[str, Any] = {"name": one.name, "kind": one.kind, "at_s": at, "gap_m": one.gap_m, "pictures": []}
+    if one.frames is not None:
+        x, y, w, h = most_different(*one.frames)
+        for rgb in one.frames:
+            marked = rgb.copy()
+            cv2.rectangle(marked, (x, y), (x + w - 1, y + h - 1), (255, 210, 0), max(1, rgb.shape[1] // 200))
+            crop = cv2.resize(rgb[y : y + h, x : x + w], (w * 2, h * 2), interpolation=cv2.INTER_CUBIC)
+            entry["pictures"].append([jpeg(smaller(picture, WIDTH_PX)) for picture in (marked, crop)])
+        entry["levels"] = float(np.abs(np.subtract(*(f[y : y + h, x : x + w].astype(np.int16) for f in one.frames))).mean())
+    return entry

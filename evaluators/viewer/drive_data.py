@@ -1,0 +1,304 @@
+"""Numbers of a page in whole centimetres, milliseconds and milliradians: the map of a scene, and what moves and happens in a rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
+from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
+from evaluators.opening import Run
+from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
+from evaluators.report.rollouts import SERIES, Event, events_of
+from evaluators.viewer.pictures import Rows, seen_before
+
+METRIC_DIGITS = 5
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where and when a scene's page counts from.
+
+    Attributes:
+        origin: ``(2,)`` metres, world: the first point of the recorded drive.
+        zero_us: The first camera frame (`evaluators.report.events.clock_zero_us`), on the scene's clock.
+    """
+
+    origin: F64
+    zero_us: int
+
+    def cm(self, xy: npt.ArrayLike) -> list[list[int]]:
+        """Return ``(N, 2)`` world metres as x and y in whole centimetres."""
+        scaled = np.rint((np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.origin) * 100.0).astype(int)
+        return [scaled[:, 0].tolist(), scaled[:, 1].tolist()]
+
+    def ms(self, t_us: I64 | Sequence[int]) -> list[int]:
+        """Return times ``(N,)`` in whole milliseconds."""
+        ms: list[int] = np.rint((np.asarray(t_us, dtype=np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
+        return ms
+
+    def track(self, trajectory: Trajectory) -> dict[str, list[int]]:
+        """Return a trajectory as t (ms), x, y (cm) and a (heading, mrad; continuous, so that it can be interpolated)."""
+        x, y = self.cm(trajectory.xyz[:, :2])
+        return {"t": self.ms(trajectory.t_us), "x": x, "y": y, "a": mrad(yaw_from_quat(trajectory.quat))}
+
+
+def mrad(yaw: npt.ArrayLike) -> list[int]:
+    """Return headings ``(N,)`` in radians as continuous whole milliradians."""
+    out: list[int] = np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
+    return out
+
+
+def rounded(values: F64) -> list[float | None]:
+    """Return values with `METRIC_DIGITS` digits; None where not finite.
+
+    Example:
+        >>> rounded(np.array([0.123456789, np.nan, 3.0]))
+        [0.12346, None, 3.0]
+    """
+    return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
+
+
+AROUND_M = 120.0  # what is farther from the recorded drive is not drawn
+TOLERANCE_M = 0.04  # of simplified lines
+
+
+def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
+    """Return the recorded drive of ``scenes/SCENE.json``, ``(N, 2)`` metres, world.
+
+    Raises:
+        InputError: It has fewer than two points.
+    """
+    log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]]).astype(np.float64)
+    if len(log) < 2:
+        raise InputError("drawing a scene", scene, f"a recorded drive of {len(log)} points", "make the run again")
+    return log
+
+
+def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
+    """Return what every view from above draws of a map, as the report's does: ``lanes``, ``paint``, ``edges`` and ``crosswalks``.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+
+    Returns:
+        Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
+    """
+    lanes = content.get("lanes") or []
+
+    def arrays(lines: Sequence[Any], least: int) -> list[F64]:
+        """Return the lines of at least so many points."""
+        return [np.asarray(line, dtype=np.float64)[:, :2] for line in lines if line is not None and len(line) >= least]
+
+    return {
+        "lanes": arrays([lane_ring(lane) for lane in lanes], 3),
+        "paint": arrays([edge for lane in lanes for edge in painted_edges(lane)], 2),
+        "edges": arrays(content.get("road_edges") or [], 2),
+        "crosswalks": arrays(content.get("crosswalks") or [], 3),
+    }
+
+
+def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:
+    """Return the map in whole centimetres.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+        log: As `recorded_drive` returns it.
+        place: Where numbers count from.
+    """
+    window = shapely.box(*(log.min(axis=0) - AROUND_M), *(log.max(axis=0) + AROUND_M))
+
+    def near(lines: Sequence[F64]) -> list[list[list[int]]]:
+        """Simplify the lines that come near."""
+        shapes = shapely.simplify([shapely.linestrings(line) for line in lines], TOLERANCE_M, preserve_topology=False)
+        kept = {shape.wkb: shape for shape in shapes if window.intersects(shape)}  # a border shared by two lanes is drawn once
+        return [place.cm(shapely.get_coordinates(shape)) for shape in kept.values()]
+
+    lines = {kind: near(some) for kind, some in drawn_map(content).items()}
+    return {"turn": round(chord_angle(log), 4), **lines, "log": place.cm(log), "source": str(content.get("source") or "")}
+
+
+PLAN_STEP_US = 500_000
+MAX_SAMPLES = 8  # of a plan; the first ones
+POSE_SERIES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
+MAX_FRAME_EVENTS = 20
+CONTACT_TOLERANCE_S = 0.25  # between a contact and the step that counts it
+
+
+class Tracks:
+    """The ways of all road users of a cell; one that several rollouts share is kept once."""
+
+    def __init__(self) -> None:
+        self.all: list[dict[str, Any]] = []
+        self._known: dict[str, int] = {}
+
+    def add(self, track: dict[str, Any]) -> int:
+        """Return a track's place in the list."""
+        key = repr(track)
+        if key not in self._known:
+            self._known[key] = len(self.all)
+            self.all.append(track)
+        return self._known[key]
+
+
+def drive_data(
+    run: Run, rollout: Rollout, log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks, frames: Rows
+) -> dict[str, Any]:
+    """Return what a page draws of a rollout, without its camera frames.
+
+    Args:
+        run: The run.
+        rollout: One that ran to its end.
+        log: Its log; None where the run folder has none: then nothing is planned and road users go as recorded.
+        content: ``scenes/SCENE.json``.
+        place: Where numbers count from.
+        tracks: Gets the ways of the road users.
+        frames: Facts of its camera frames.
+    """
+    steps = run.steps_of(rollout)
+    manifest = run.manifest(rollout)
+    ego, size_m = _ego(log, steps, content, place)
+    return {
+        "ego": ego,
+        "size": [round(100 * side) for side in size_m],
+        "rear": 0 if log is None else round(100 * float(log.T_rig_box[0, 3])),
+        "users": _road_users(log, content, place, tracks),
+        "as_driven": log is not None,
+        "plans": [] if log is None else [_plan(plan, place) for plan in log.plans],
+        "curves": curves(steps, place),
+        "moments": moments(rollout, steps, manifest, place, frames),
+    }
+
+
+def _ego(log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], place: Place) -> tuple[dict[str, list[int]], F64]:
+    """Return the way of the ego's box centre, and its length and width in metres."""
+    if log is not None:
+        return place.track(log.ego), np.array([log.ego_box.length_m, log.ego_box.width_m])
+    vehicle = content.get("vehicle") or {}
+    own = next(iter(series_by_cell(steps.filter(pc.is_in(steps["metric"], pa.array(POSE_SERIES)))).values()), {}) if len(steps) else {}
+    if any(name not in own for name in POSE_SERIES) or "length_m" not in vehicle:
+        raise InputError("reading a rollout to watch", "the table of steps", "neither a log nor the ego's poses", "run it again")
+    (t_us, x), (_, y), (_, yaw) = (own[name] for name in POSE_SERIES)
+    ahead_m = float(vehicle["rear_axle_to_centre_m"])
+    x_cm, y_cm = place.cm(np.stack([x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw)], axis=1))
+    return {"t": place.ms(t_us), "x": x_cm, "y": y_cm, "a": mrad(yaw)}, np.array([vehicle["length_m"], vehicle["width_m"]])
+
+
+def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks) -> list[int]:
+    if log is not None:
+        boxes = {a.actor_id: (a.box.length_m, a.box.width_m, a.box.height_m) for a in log.actors.values()}
+        return [tracks.add(_user(a.actor_id, a.label, boxes[a.actor_id], place.track(a.track))) for a in log.actors.values()]
+    found = []
+    for actor in content.get("actors") or []:
+        if actor.get("x_m") and actor.get("length_m"):
+            x, y = place.cm(np.column_stack([actor["x_m"], actor["y_m"]]))
+            way = {"t": place.ms(actor["t_us"]), "x": x, "y": y, "a": mrad(actor["yaw_rad"])}
+            found.append(tracks.add(_user(actor.get("id") or "", actor.get("label") or "", (actor["length_m"], actor["width_m"]), way)))
+    return found
+
+
+def _user(name: str, label: str, size_m: tuple[float, ...], way: dict[str, list[int]]) -> dict[str, Any]:
+    if len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1:  # it stands: two poses say when it is there
+        way = {key: [values[0], values[-1]] for key, values in way.items()}
+    return {"id": name, "label": label or "other", "size": [round(100 * side) for side in size_m], **way}
+
+
+def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
+    """Return a plan and its samples, every half second: points from now on."""
+    lines = []
+    for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES]):
+        times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
+        lines.append(place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1)))
+    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": lines}
+
+
+def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
+    """Return every metric over time: t (ms), v (null where invalid), and why it is invalid where it is.
+
+    Args:
+        steps: As `Run.steps_of` returns them.
+        place: Where times count from.
+    """
+    if not steps.num_rows:
+        return {}
+    names = np.asarray(steps["metric"].to_pylist())
+    order = np.lexsort((steps["t_us"].to_numpy(), names))
+    names, t_us = names[order], steps["t_us"].to_numpy()[order]
+    value = np.where(steps["valid"].to_numpy(), steps["value"].to_numpy(), np.nan)[order]
+    reason = np.asarray([text or "" for text in steps["reason"].to_pylist()])[order]
+    borders = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
+    out = {}
+    for start, stop in pairwise(borders):
+        if names[start] in POSE_SERIES:
+            continue
+        here = slice(start, stop)
+        why = list(dict.fromkeys(str(text) for text in reason[here] if text))
+        out[str(names[start])] = {"t": place.ms(t_us[here]), "v": rounded(value[here])} | ({"why": "; ".join(why)} if why else {})
+    return out
+
+
+def moments(rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place, frames: Rows) -> list[dict[str, Any]]:
+    """List what happened when: counted collisions and departures from the road, and frames that a guard replaced or named."""
+    known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
+    series = series_by_cell(known)
+    first_us = min((int(t[0]) for own in series.values() for t, _ in own.values()), default=place.zero_us)
+    found: list[dict[str, Any]] = []
+    for event in events_of(rollout, series):
+        ms = None if event.t_us is None else round((event.t_us - place.zero_us) / 1000)
+        seen = "" if event.t_us is None else seen_before(frames, event.t_us)
+        text = event.what + _with_whom(event, manifest, first_us) + (f"; {seen}" if seen else "")
+        found.append({"t": ms, "kind": event.kind, "text": text})
+    return found + _frame_events(frames, place)
+
+
+def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
+    if event.kind != "collision" or event.t_us is None:
+        return ""
+    at_s = (event.t_us - first_us) * 1e-6
+    near = [c for c in manifest.get("contacts") or [] if abs(float(c["t_s"]) - at_s) <= CONTACT_TOLERANCE_S]
+    return f" with {near[0]['actor_id']}" if near else ""
+
+
+def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
+    """Return when an event of the frames began, such as a fixer's frame that was replaced; one that goes on is told once."""
+    found: list[dict[str, Any]] = []
+    before: set[str] = set()
+    for row in frames:
+        now = set(str(row.get("events") or "").split())
+        t_us = row.get("t_us")
+        if isinstance(t_us, int):
+            t_ms = round((t_us - place.zero_us) / 1000)
+            found += [{"t": t_ms, "kind": "frame", "text": f"frame: {name}"} for name in sorted(now - before)]
+        before = now
+    return found[:MAX_FRAME_EVENTS]
+
+
+def plans_part(flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool) -> list[dict[str, Any]]:
+    """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in `WatchedCell`."""
+
+    def sides(entry: Mapping[str, Any]) -> tuple[str, str]:
+        """Return what the two are called."""
+        if by_policy:
+            return str(entry["policy"]), str(entry["against"]).removeprefix(f"{entry['renderer']}/")
+        return str(entry["renderer"]), str(entry["baseline"])
+
+    return [
+        {
+            "t": round((int(entry["t_us"]) - place.zero_us) / 1000),
+            "kind": "plans",
+            "text": f"plans part by {float(entry['gap_m']):.2f} m from {sides(entry)[1]}",
+            "renderer": sides(entry)[0],
+        }
+        for entry in flips
+        if entry.get("t_us") is not None
+    ]

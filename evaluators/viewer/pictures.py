@@ -1,0 +1,147 @@
+"""The camera frames of a rollout, from its log or else its video, made small enough for a page, and where a fixer took them from."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8, LoggedImage, RolloutLog
+from alpasim_plugin.log import decode_image, read_facts
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, VIDEO_NAME
+from alpasim_plugin.log.video import VideoReader
+from evaluators.opening import Run
+
+JPEG_QUALITY = 76
+BEFORE_US = 1_000_000  # of an event: the pictures that led to it
+NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
+
+
+Rows = Sequence[Mapping[str, Any]]  # facts of the frames, as `frames.jsonl` has them
+
+
+@dataclass(frozen=True)
+class Fineness:
+    """How finely frames are kept.
+
+    Attributes:
+        stride: Every how manieth frame is kept.
+        width_px: Frames wider than this are made smaller.
+    """
+
+    stride: int = 1
+    width_px: int = 512
+
+
+@dataclass(frozen=True)
+class Source:
+    """The frames that a rollout has of one camera: encoded ones of a log, or a video's.
+
+    Attributes:
+        images: In order of time; empty for a video.
+        video: The file, and the time of its first frame in microseconds.
+    """
+
+    camera: str
+    images: tuple[LoggedImage, ...] = ()
+    video: tuple[Path, int] | None = None
+
+    def decoded(self, image: LoggedImage) -> U8:
+        """Return the ``(H, W, 3)`` uint8 sRGB of one of the images.
+
+        Raises:
+            InputError: It cannot be decoded.
+        """
+        return decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
+
+    def filmed(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
+        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame of the video; nothing where there is none.
+
+        Raises:
+            InputError: A frame cannot be decoded.
+        """
+        if self.video is None:
+            return
+        path, start_us = self.video
+        with VideoReader(path) as video:
+            for index, frame in enumerate(video):
+                if index % stride == 0:
+                    yield start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image
+
+
+def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
+    """Return the cameras of a rollout that have frames, in the log's order; empty where none was kept."""
+    if log is not None and log.images:
+        cameras = dict.fromkeys(image.camera for image in log.images)
+        return [Source(name, tuple(image for image in log.images if image.camera == name)) for name in cameras]
+    video = run.file_of(rollout, VIDEO_NAME)
+    if video is None:
+        return []
+    return [Source(VIDEO_NAME.removesuffix(".mp4"), video=(video, log.render_start_us if log is not None else 0))]
+
+
+def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
+    """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in base64."""
+
+    def made(t_us: int, rgb: U8) -> tuple[int, tuple[int, ...], str]:
+        picture = smaller(rgb, fine.width_px)
+        return round((t_us - zero_us) / 1000), picture.shape, jpeg(picture)
+
+    with ThreadPoolExecutor(thread_name_prefix="pictures") as threads:  # OpenCV does not hold Python's lock
+        frames = list(threads.map(lambda image: made(image.end_us, source.decoded(image)), source.images[:: fine.stride]))
+    frames += [made(t_us, rgb) for t_us, rgb in source.filmed(fine.stride)]
+    height, width = frames[-1][1][:2] if frames else (0, 0)
+    t_ms, data = [t for t, _, _ in frames], [data for _, _, data in frames]
+    return {"name": source.camera, "width": width, "height": height, "t": t_ms, "jpeg": data}
+
+
+def jpeg(rgb: U8) -> str:
+    """Encode a picture ``(H, W, 3)`` for a page, as base64."""
+    # Halved colour resolution and optimised tables: a page is looked at, not measured.
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    if not done:
+        raise InputError("encoding a camera frame", f"array {rgb.shape}", "the encoder refused", "use smaller images")
+    return base64.b64encode(data.tobytes()).decode()
+
+
+def smaller(rgb: U8, width_px: int) -> U8:
+    """Return a picture no wider than this, with its shape kept."""
+    height, width = rgb.shape[:2]
+    if width <= width_px:
+        return rgb
+    size = (width_px, max(1, round(height * width_px / width)))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def frame_rows(run: Run, rollout: Rollout) -> Rows:
+    """Return the facts of a rollout's camera frames; none where the run kept none."""
+    path = run.file_of(rollout, FRAMES_NAME)
+    return read_facts(path) if path is not None else []
+
+
+def trust_by_time(rows: Rows, camera: str) -> dict[int, str]:
+    """Return the text of `fixers.trust.trust_cells` of a camera's frames by time, microseconds."""
+    return {int(row["t_us"]): str(row[TRUST_CELLS]) for row in rows if row.get("camera") == camera and TRUST_CELLS in row}
+
+
+def seen_before(rows: Rows, t_us: int) -> str:
+    """Say how much of the pictures in the second before an instant was guessed and recorded; empty where no fixer says so.
+
+    Example:
+        >>> seen_before([{"t_us": 0, "guessed_share": 0.1, "recorded_share": 0.5}], 300_000)
+        '10 % of what it saw in the second before was made up by the fixer, 50 % was recorded'
+    """
+    near = [row for row in rows if GUESSED_SHARE in row and t_us - BEFORE_US <= int(row["t_us"]) <= t_us]
+    if not near:
+        return ""
+    guessed, recorded = (sum(float(row[name]) for row in near) / len(near) for name in (GUESSED_SHARE, RECORDED_SHARE))
+    return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace("%", " %")

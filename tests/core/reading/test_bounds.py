@@ -1,0 +1,136 @@
+"""Rule 1: every quantity has one bound, and every source is checked against it before anything is built."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.options import parse_seeds
+from alpasim_plugin.core import limits as bounds
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import Bound
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.world.idm import Bodies, find_leader, find_leaders
+from alpasim_plugin.world.path import FEW_DISTANCES, nearest, polyline_path
+from scenarios.budget import check_scenario
+from scenarios.load import load_scenario
+from tests.fuzz import seen
+
+REFUSED = (
+    "road of 1e6 m", "road of 1e15 m", "road of 1e308 m", "OpenDRIVE s = 1e5", "OpenDRIVE curvature 1e9", "AV2 width 1e300",
+    "usdz size NaN", "usdz size 1e9", "size_m 1e6", "1e9 trees", "poles every 1e-9 m", "20,000 parked cars", "CommonRoad time -1e308",
+    "4 MB of '- a'", "error of 7 MB", "pipe as scenario", "pipe as CommonRoad", "pipe as AlpaSim scene", "path of 5,000 characters",
+)  # fmt: skip
+
+
+def test_every_bound_has_a_range_a_reason_and_a_name_of_its_own() -> None:
+    known = [value for value in vars(bounds).values() if isinstance(value, Bound)]
+    assert len(known) > 50
+    assert all(bound.low < bound.high and bound.reason and bound.name for bound in known)
+    assert len({bound.name for bound in known}) == len(known)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.3, 0.3])
+def test_values_outside_a_bound_are_refused_with_number_range_and_reason(value: float) -> None:
+    with pytest.raises(InputError) as error:
+        bounds.CURVATURE_PER_M.check(value, "reading a road", "a.xml, road 3")
+    assert "-0.2 to 0.2 1/m" in error.value.found
+    assert "radius" in error.value.do_this
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_once_gave_way_is_refused(tmp_path: Path, name: str) -> None:
+    arguments = seen.SEEN[name](tmp_path)
+    with pytest.raises(InputError) as error:
+        load_scenario(arguments[-1])
+    parts = (error.value.doing, error.value.with_what, error.value.found, error.value.do_this)
+    assert all(0 < len(part) <= 300 for part in parts)
+
+
+@pytest.mark.parametrize("text", ["1000000000000", "0", "-3", "nan", "9223372036854775808,1"])
+def test_counts_of_seeds_are_bounded(text: str) -> None:
+    with pytest.raises(InputError):
+        parse_seeds(text)
+
+
+def test_a_long_map_costs_what_the_drive_can_see(tmp_path: Path) -> None:
+    short, long = (load_scenario(seen.xodr(length)(folder(tmp_path, length))[-1]) for length in ("900", "9000"))
+    assert long.ground.z.size <= 1.5 * short.ground.z.size
+    assert len(long.lane_map.road_edges[0]) > 8 * len(short.lane_map.road_edges[0])  # the map itself is whole
+
+
+def folder(root: Path, name: str) -> Path:
+    (root / name).mkdir()
+    return root / name
+
+
+def drive_of(length_m: float, scenario: Scenario) -> Scenario:
+    n = len(scenario.ego_log)
+    xyz = np.column_stack([np.linspace(0, length_m, n), np.zeros((n, 2))])
+    return replace(scenario, ego_log=replace(scenario.ego_log, xyz=xyz))
+
+
+def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built() -> None:
+    scenario = load_scenario("smoke/straight")
+    check_scenario(drive_of(3000.0, scenario), "a log")
+    with pytest.raises(InputError, match=r"Gaussians, at most 20,000,000: about \d+ GiB and \d+ s to build"):
+        check_scenario(drive_of(9000.0, scenario), "a log")
+    with pytest.raises(InputError, match="road users"):
+        check_scenario(replace(scenario, actors=load_scenario("smoke/lead_car").actors * 1001), "a log")
+
+
+def queue(n: int, seed: int) -> tuple[Bodies, np.ndarray]:
+    random = np.random.Generator(np.random.Philox(seed))
+    s = np.sort(random.uniform(0, 400, n))
+    xy = np.column_stack([s, random.choice([0.0, 0.0, 1.4, 3.5, -9.0], n)])
+    yaw = random.uniform(-0.3, 0.3, n)
+    velocity = random.uniform(0, 10, (n, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    return Bodies(xy, yaw, np.full(n, 2.3), np.full(n, 0.9), velocity), s
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.004, -0.006])
+def test_leaders_of_a_queue_are_those_that_each_driver_finds_alone(bend: float) -> None:
+    bodies, s = queue(40, 5)
+    x = np.arange(0, 420.0)
+    heading = bend * x
+    path = polyline_path(np.column_stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading))]))
+    xyz, yaw = path.at(s, bodies.xy[:, 1])
+    bodies = replace(bodies, xy=xyz[:, :2], yaw=yaw + bodies.yaw)
+    fronts, half = s + 2.3, np.full(len(s), 0.9)
+    together = find_leaders(path, fronts, half, bodies, np.arange(len(s)))
+    alone = [find_leader(path, front, 0.9, bodies, own_row=i) for i, front in enumerate(fronts)]
+    assert together == alone
+    assert sum(leader.index >= 0 for leader in alone) > 20
+
+
+def test_on_a_loop_the_place_of_a_body_depends_on_who_asks() -> None:
+    angle = np.linspace(0, 2 * np.pi, 300)
+    path = polyline_path(np.column_stack([60 * np.sin(angle), 60 - 60 * np.cos(angle)]))
+    places, yaw = path.at(np.array([5.0, 30.0, path.length_m - 4.0]))
+    bodies = Bodies(places[:, :2], yaw, np.full(3, 2.3), np.full(3, 0.9), np.zeros((3, 2)))
+    fronts, rows = np.array([7.3, 32.3, path.length_m - 1.7]), np.arange(3)
+    alone = [find_leader(path, front, 0.9, bodies, own_row=row) for front, row in zip(fronts, rows, strict=True)]
+    assert find_leaders(path, fronts, np.full(3, 0.9), bodies, rows) == alone
+
+
+def test_the_tree_names_the_station_that_comparing_all_names() -> None:
+    stations = np.column_stack([np.arange(0, 500, 0.25), np.zeros(2000)])
+    points = np.column_stack([np.linspace(-3, 505, 400).round(3), np.full(400, 2.0)])
+    points[:50, 0] = np.arange(50) + 0.125  # halfway between two stations
+    assert len(points) * len(stations) > FEW_DISTANCES
+    few = np.concatenate([nearest(points[i : i + 50], stations) for i in range(0, 400, 50)])
+    assert np.array_equal(nearest(points, stations), few)
+
+
+def test_the_schema_and_the_readers_name_the_same_limits() -> None:
+    schema = json.loads((Path(__file__).resolve().parents[3] / "scenarios" / "schema.json").read_text())
+    arc = schema["$defs"]["ArcSegment"]["properties"]
+    assert (arc["curvature_per_m"]["minimum"], arc["curvature_per_m"]["maximum"]) == (
+        bounds.CURVATURE_PER_M.low,
+        bounds.CURVATURE_PER_M.high,
+    )
+    assert arc["length_m"]["maximum"] == bounds.SEGMENT_M.high

@@ -1,0 +1,152 @@
+"""The working directory may come from anybody: nothing in it runs unless it is named."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.parts.source import load
+from alpasim_plugin.core.subprocesses import OURS, SAFE_PATH, own_path_only
+from tests.examples import first_of
+
+REPO = Path(__file__).resolve().parents[2]
+# What libraries of ours import if it is there, and what Python itself imports when it starts a worker.
+BAITS = (
+    "colorama", "numexpr", "bottleneck", "pytz", "coverage", "multiprocessing", "selectors", "pickle", "runpy", "sitecustomize",
+    "usercustomize", "IPython", "readline",
+)  # fmt: skip
+SCRIPT = f"import sys\nsys.path.append({str(REPO)!r})\nfrom alpasim_plugin.cli.main import main\nif __name__ == '__main__':\n    main()\n"
+DRIVE = ("run", "--renderer", "clean", "--images", "none", "--certify", "none", "--no-report", "--seeds", "2")
+POLICY = """
+import with_me
+from pydantic import BaseModel
+class Settings(BaseModel):
+    speed: float = 5.0
+class Mine(with_me.Base):
+    settings_model = Settings
+"""
+BASE = "from policies.simple import ConstantVelocity as Base\n"
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """Give a folder in which everything that is imported or loaded leaves its name in ``ran``."""
+    tmp_path = tmp_path / "work"
+    tmp_path.mkdir()
+    for name in BAITS:
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write('{name} ')\n")
+    (tmp_path / "evil.py").write_text((tmp_path / "pytz.py").read_text())
+    info = tmp_path / "evil-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evil\nVersion: 1.0\n")
+    groups = ("simrun.policies", "simrun.evaluators", "simrun.sources", "simrun.renderers", "pydantic", "numba_extensions")
+    (info / "entry_points.txt").write_text("".join(f"[{group}]\nevil = evil:Evil\n" for group in groups))
+    return tmp_path
+
+
+def simrun(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder by a script that lies elsewhere, as the installed one does."""
+    script = folder.parent / "bin" / "simrun"
+    script.parent.mkdir(exist_ok=True)
+    script.write_text(SCRIPT)
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    command = [sys.executable, str(script), *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240)
+
+
+def ran(folder: Path) -> str:
+    return (folder / "ran").read_text() if (folder / "ran").exists() else ""
+
+
+QUICK = (["runs", "."], ["report", "one"], ["list", "policies"])
+MORE = (
+    ["compare", "one"], ["check", "one"], ["gate", "one"], ["view", "one"], ["preview", "smoke/straight"],
+    [*DRIVE, "--dry-run", "smoke/straight"], ["list", "metrics"], ["score", "one"],
+)  # fmt: skip
+
+
+@pytest.mark.slow  # `test_ways_to_run_code` tries the same folder in a few seconds
+@pytest.mark.parametrize("commands", [QUICK, MORE], ids=["quick", "more"])
+def test_no_command_runs_what_lies_in_the_working_directory(hostile: Path, commands: Sequence[list[str]]) -> None:
+    first = simrun(hostile, *DRIVE, "--workers", "2", "--out", "one", "smoke/straight")
+    assert first.returncode == 0, first.stderr
+    assert ran(hostile) == ""
+    for command in commands:
+        done = simrun(hostile, *command)
+        assert "Traceback" not in done.stderr, command
+        assert ran(hostile) == "", command
+        assert "evil" not in done.stdout, command
+
+
+NAMES = ("pack.inner.policy:Mine", "my_policy.py:Mine", "my_policy:Mine", "pack/inner/policy.py:Mine")
+
+
+@pytest.mark.parametrize("name", first_of(NAMES))
+@pytest.mark.slow
+def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also_in_workers(hostile: Path, name: str) -> None:
+    (hostile / "my_policy.py").write_text(POLICY)
+    (hostile / "with_me.py").write_text(BASE)
+    inner = hostile / "pack" / "inner"
+    inner.mkdir(parents=True)
+    (hostile / "pack" / "__init__.py").write_text("")
+    (inner / "__init__.py").write_text("")
+    (inner / "policy.py").write_text(POLICY.replace("import with_me", "from .. import with_me\nfrom pack.inner import also"))
+    (inner / "also.py").write_text("")
+    (hostile / "pack" / "with_me.py").write_text(BASE)
+    done = simrun(hostile, *DRIVE, "--policy", name, "--workers", "2", "--out", "mine", "smoke/straight", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((hostile / "mine" / "run.json").read_text())["policies"]
+    assert ran(hostile) == ""
+
+
+def test_only_what_a_named_file_imports_can_be_imported_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "asks.py").write_text("import beside_asks\nfound = beside_asks.found\n")
+    (tmp_path / "beside_asks.py").write_text("found = 3\n")
+    (tmp_path / "not_asked.py").write_text("")
+    path = list(sys.path)
+    assert load(f"{tmp_path}/asks.py:found", "policy") == 3
+    assert sys.path == path
+    with pytest.raises(ModuleNotFoundError):
+        __import__("not_asked")
+
+
+def test_a_file_never_stands_in_for_an_installed_module(tmp_path: Path) -> None:
+    (tmp_path / "calls.py").write_text("import shapely\nfound = shapely.__version__\n")
+    (tmp_path / "shapely.py").write_text("import numexpr_of_nobody\n")
+    (tmp_path / "numexpr_of_nobody.py").write_text("")
+    assert load(f"{tmp_path}/calls.py:found", "policy")[0].isdigit()
+    with pytest.raises(ModuleNotFoundError):
+        __import__("numexpr_of_nobody")
+
+
+def test_two_files_beside_modules_of_one_name_are_refused(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "part.py").write_text("from same_name_twice import Mine\n")
+        (tmp_path / name / "same_name_twice.py").write_text(f"{BASE}class Mine(Base):\n    note = '{name}'\n")
+    assert resolve("policy", f"{tmp_path}/a/part.py:Mine").note == "a"
+    with pytest.raises(InputError, match="same_name_twice was imported from"):
+        resolve("policy", f"{tmp_path}/b/part.py:Mine")
+
+
+def test_a_worker_on_a_cluster_has_no_working_directory_on_its_path_unless_the_user_put_it_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path])
+    monkeypatch.setenv(SAFE_PATH, OURS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    own_path_only()
+    assert str(tmp_path) in sys.path
+    assert SAFE_PATH not in os.environ, "a command of the user's that the worker starts finds files beside its script"
+    monkeypatch.delenv("PYTHONPATH")
+    own_path_only()
+    assert not {"", str(tmp_path)} & set(sys.path)

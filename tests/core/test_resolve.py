@@ -1,0 +1,172 @@
+"""What a name stands for, what a part declares, and what its digest sees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
+from alpasim_plugin.core.parts import complete, names, resolve, resolve_renderer, spec
+from alpasim_plugin.core.parts.resolve import PLAIN_KINDS
+from alpasim_plugin.core.parts.source import OWN_ROOT, code_digest, code_files, load, reached
+from alpasim_plugin.core.parts.spec import BUILTIN, KINDS
+
+DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "missing", "metrics", "controller")
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> None:
+    for name, text in names(kind).items():  # type: ignore[arg-type]
+        behind = {"/": "127.0.0.1:1", ":": "sh serve.sh"}.get(name[-1], "")
+        spec = resolve(kind, name + behind)  # type: ignore[arg-type]
+        assert (spec.digest is None) == bool(behind), name  # what is behind an address or a command is not known here
+        assert text
+        assert "\n" not in text
+
+
+@pytest.mark.parametrize("kind", PLAIN_KINDS)
+def test_shipped_parts_of_plain_kinds_declare_nothing(kind: str) -> None:
+    for target in (target for name, (target, _) in BUILTIN[kind].items() if not name.endswith("://")):
+        factory = load(target, kind)
+        own = {name for name in DECLARED if getattr(factory, name, None)}
+        assert own == set(), target
+
+
+def test_a_step_count_at_the_end_belongs_to_the_fixer() -> None:
+    assert str(resolve_renderer("onefixer+clean@2")) == "onefixer@2+clean"
+
+
+def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text(
+        "class Shows:\n    def render(self, request): ...\n"
+        "class Fixes:\n    def reset(self, seed): ...\n    def step(self, block, maps): ...\n"
+    )
+    assert resolve_renderer(f"{file}:Shows").fixer is None
+    assert str(resolve_renderer(f"{file}:Fixes")) == f"{file}:Fixes+3dgs"
+    assert str(resolve_renderer(f"{file}:Fixes+{file}:Shows")) == f"{file}:Fixes+{file}:Shows"
+
+
+def test_a_module_that_raises_is_told_with_what_it_raised(tmp_path: Path) -> None:
+    file = tmp_path / "raises.py"
+    file.write_text("raise RuntimeError('no licence')\n")
+    with pytest.raises(InputError, match="RuntimeError: no licence"):
+        resolve("policy", f"{file}:Mine")
+
+
+def test_the_digest_follows_imports_wherever_they_stand(tmp_path: Path) -> None:
+    package = tmp_path / "pack"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "part.py").write_text(
+        "from typing import TYPE_CHECKING\n\nfrom . import near\n"
+        "from pack.other import (\n    one,  # a comment, with a comma\n    two,\n)\n\n"
+        "if TYPE_CHECKING:\n    from pack.typed import Unused\n\n\ndef late():\n    import beside\n"
+    )
+    for name in ("near", "other", "typed"):
+        (package / f"{name}.py").write_text(f"NAME = '{name}'\n")
+    (tmp_path / "beside.py").write_text("import pack.part\n")
+    part = package / "part.py"
+    assert {Path(path).name for path in reached(part)} == {"__init__.py", "part.py", "near.py", "other.py", "beside.py"}
+    before = code_digest(part)
+    (package / "typed.py").write_text("NAME = 'another'\n")
+    assert code_digest(part) == before
+    (tmp_path / "beside.py").write_text("import pack.part  # edited\n")
+    assert code_digest(part) != before
+
+
+def test_an_installed_part_does_not_reach_other_distributions(tmp_path: Path) -> None:
+    site = tmp_path / "site-packages"
+    site.mkdir()
+    (site / "mine.py").write_text("import theirs\nimport alpasim_plugin.core.types\n")
+    (site / "theirs.py").write_text("")
+    found = {Path(path).name for path in reached(site / "mine.py")}
+    assert "theirs.py" not in found
+    assert {"mine.py", "types.py"} <= found
+
+
+def test_optional_members_get_their_defaults_and_required_ones_are_named() -> None:
+    class Bare:
+        def render(self, request: object) -> object:
+            return request
+
+    renderer = complete(Bare(), Renderer)
+    assert (renderer.lookahead, renderer.block, dict(renderer.stage_ms), renderer.facts()) == (0, None, {}, {})  # type: ignore[attr-defined]
+    assert renderer.render_batch([1, 2]) == [1, 2]  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match="a Bare without reset, step"):
+        complete(Bare(), Fixer)
+
+
+def test_a_fixer_without_preview_previews_on_a_copy_of_itself() -> None:
+    class Counts:
+        blocks = BlockRule(2, 2)
+        seen = 0
+
+        def reset(self, seed: int) -> None:
+            self.seen = 0
+
+        def step(self, block: list[int], maps: list[object]) -> list[int]:
+            self.seen += len(block)
+            return [self.seen] * len(block)
+
+    fixer = complete(Counts(), Fixer)
+    assert fixer.preview([1], []) == [1]  # type: ignore[attr-defined]
+    assert fixer.seen == 0
+    assert fixer.step([1, 2], []) == [2, 2]
+
+
+def test_a_module_edited_after_its_import_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "edited.py"
+    file.write_text("class Mine:\n    controller = 'perfect'\n")
+    assert resolve("policy", f"{file}:Mine").controller == "perfect"
+    assert resolve("policy", f"{file}:Mine").controller == "perfect"
+    file.write_text("class Mine:\n    controller = 'bicycle'\n")
+    with pytest.raises(InputError, match="was edited after this process had imported it"):
+        resolve("policy", f"{file}:Mine")
+
+
+def own_files(path: Path) -> set[str]:
+    return {name.removeprefix(f"{OWN_ROOT}/") for name in code_files(path)}
+
+
+def test_the_digest_follows_names_that_our_packages_import_lazily(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from evaluators import PRESETS\nfrom alpasim_plugin.gaussians import (\n    GaussianCloud,\n)\n")
+    assert {"evaluators/metrics/presets.py", "alpasim_plugin/gaussians/cloud.py"} <= own_files(file)
+    assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" not in own_files(file)
+
+
+def test_a_part_that_may_name_others_depends_on_all_of_ours(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from alpasim_plugin import make_renderer\n")
+    assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" in own_files(file)
+
+
+def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    home = "policies/simple.py"
+    digest = resolve("policy", "policies:ConstantVelocity").digest
+    whole = spec.code_digest
+    monkeypatch.setattr(spec, "code_digest", lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""))
+    assert resolve("policy", "policies:ConstantVelocity").digest != digest
+
+
+def test_settings_in_brackets_make_another_arm_of_one_fixer() -> None:
+    plain, without = resolve_renderer("identity"), resolve_renderer("identity[references=0,tolerance_m=0.5]+clean")
+    assert (without.name, str(without)) == ("identity[references=0,tolerance_m=0.5]+clean", "identity[references=0,tolerance_m=0.5]+clean")
+    assert without.fixer is not None
+    assert plain.fixer is not None
+    assert without.fixer.settings.tolerance_m == 0.5  # type: ignore[union-attr]
+    assert without.fixer.digest != plain.fixer.digest
+
+
+def test_a_bracket_counts_for_its_own_arm_and_over_what_is_set_for_all() -> None:
+    own = resolve_renderer("identity[tolerance_m=0.5]", ["tolerance_m=0.25", "tolerance_deg=0.75"])
+    assert (own.fixer.settings.tolerance_m, own.fixer.settings.tolerance_deg) == (0.5, 0.75)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", ["clean[a=1]", "identity[]", "identity[a]", "identity[a=1", "identity[a=1][b=2]"])
+def test_brackets_without_settings_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match="bracket"):
+        resolve_renderer(name)

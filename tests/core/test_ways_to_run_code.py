@@ -1,0 +1,257 @@
+"""Ways in which files from a stranger could run as code: none does, in whatever verb meets them.
+
+Each way is a bait that leaves its name in a file if it is run. The working directory is the stranger's folder.
+"""
+
+from __future__ import annotations
+
+import pickle
+import stat
+import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS_FOLDER
+from tests.core.checksum_files import vouch_for
+from tests.core.test_hostile_folder import DRIVE, simrun
+
+Way = Callable[[Path, "Bait"], list[list[str]]]  # (folder, bait) -> commands to try
+
+
+class Bait:
+    """What leaves its name in a file when it is run, in the languages that the ways need."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.mark, self.name = folder.parent / "ran", name
+
+    @property
+    def python(self) -> str:
+        return f"open({str(self.mark)!r}, 'a').write({self.name!r} + ' ')\n"
+
+    @property
+    def shell(self) -> str:
+        return f"echo {self.name} >> {self.mark}"
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return exec, (self.python,)
+
+
+def python_file(*names: str) -> Way:
+    def way(folder: Path, bait: Bait) -> list[list[str]]:
+        for name in names:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(bait.python)
+        return [["compare", "run"], ["list", "policies"], ["run", "--dry-run", *DRIVE[1:], "smoke/straight"]]
+
+    return way
+
+
+def metadata(folder: Path, bait: Bait) -> list[list[str]]:
+    (folder / "evil.py").write_text(bait.python)
+    info = folder / "evil-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evil\nVersion: 1.0\n")
+    groups = ("simrun.policies", "simrun.commands", "simrun.evaluators", "simrun.sources", "numba_extensions", "pydantic")
+    (info / "entry_points.txt").write_text("".join(f"[{group}]\nevil = evil:Evil\n" for group in groups))
+    return [["list", "policies"], ["--help"], ["evil"]]
+
+
+def path_file(folder: Path, bait: Bait) -> list[list[str]]:
+    (folder / "evil.pth").write_text(f"import os; exec({bait.python!r})\n")
+    (folder / "lib" / "python3.11" / "site-packages").mkdir(parents=True)
+    (folder / "lib" / "python3.11" / "site-packages" / "evil.pth").write_text(f"import os; exec({bait.python!r})\n")
+    (folder / "pyvenv.cfg").write_text("home = .\n")
+    return [["compare", "run"]]
+
+
+def git_hooks(folder: Path, bait: Bait) -> list[list[str]]:
+    subprocess.run(["git", "init", "-q", "."], cwd=folder, check=True)
+    (folder / "kept.txt").write_text("as committed")
+    subprocess.run(["git", "add", "kept.txt"], cwd=folder, check=True)
+    subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "a"], cwd=folder, check=True)
+    (folder / "kept.txt").write_text("otherwise")
+    hook = folder / "hook"
+    hook.write_text(f"#!/bin/sh\n{bait.shell}\n")
+    hook.chmod(hook.stat().st_mode | stat.S_IXUSR)
+    core = (f"core.{name}" for name in ("fsmonitor", "sshCommand", "pager", "editor", "hooksPath"))
+    for name in (*core, "diff.external", "filter.x.clean", "gpg.program"):
+        subprocess.run(["git", "config", name, str(hook) if name != "core.hooksPath" else "."], cwd=folder, check=True)
+    for name in ("post-checkout", "pre-commit", "post-index-change"):
+        (folder / name).write_bytes(hook.read_bytes())
+        (folder / name).chmod(0o755)
+    (folder / ".gitattributes").write_text("* filter=x\n")
+    return [[*DRIVE, "--out", "new", "--seeds", "1", "smoke/straight"]]
+
+
+def yaml_tags(folder: Path, bait: Bait) -> list[list[str]]:
+    (folder / "tag.yaml").write_text(f"!!python/object/apply:os.system [{bait.shell!r}]\n")
+    (folder / "key.yaml").write_text(f"version: 1\nscene_id: !!python/object/apply:os.system [{bait.shell!r}]\n")
+    commands = [["run", "--dry-run", *DRIVE[1:], name] for name in ("tag.yaml", "key.yaml")]
+    return [*commands, ["gate", "run", "--gate", "tag.yaml"]]
+
+
+def pickles_of_a_run(folder: Path, bait: Bait) -> list[list[str]]:
+    for name in (".slurm/s/1_0_result.pkl", ".slurm/s/1_submitted.pkl", "results.pkl", "rollouts.pkl"):
+        (folder / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "run" / name).write_bytes(pickle.dumps(("success", bait)))
+    return [["check", "run"], ["report", "run"], [*DRIVE, "--out", "run", "--resume", "smoke/straight"]]
+
+
+def weights(folder: Path, bait: Bait) -> list[list[str]]:
+    torch.save({"weight": bait}, folder / "evil.pt")
+    (folder / "evil.pkl.pt").write_bytes(pickle.dumps(bait))
+    (folder / "evil.safetensors").write_bytes(pickle.dumps(bait))
+    return [
+        ["run", *DRIVE[3:], "--renderer", "onefixer", "--set", f"fixer.weights={name}", "--dry-run", "smoke/straight"]
+        for name in ("evil.pt", "evil.pkl.pt", "evil.safetensors")
+    ]
+
+
+def object_arrays(folder: Path, bait: Bait) -> list[list[str]]:
+    np.save(folder / "evil.npy", np.array([bait], dtype=object), allow_pickle=True)
+    np.savez(folder / "evil.npz", a=np.array([bait], dtype=object))
+    (folder / "evil.asl").write_bytes((folder / "evil.npy").read_bytes())
+    return [["score", "evil.asl", "--scene", "smoke/straight", "--out", "scored"], ["preview", "evil.npz"]]
+
+
+def archive_that_leaves_its_folder(folder: Path, bait: Bait) -> list[list[str]]:
+    with zipfile.ZipFile(folder / "evil.usdz", "w") as archive:
+        for name in ("../evil.py", "../../sitecustomize.py", "/tmp/evil-of-an-archive.py", "metadata.yaml"):
+            archive.writestr(name, bait.python)
+    return [["run", "--dry-run", *DRIVE[1:], "evil.usdz"], ["preview", "evil.usdz"]]
+
+
+def links(folder: Path, bait: Bait) -> list[list[str]]:
+    target = folder.parent / "not-mine.txt"
+    target.write_text("mine")
+    for name in ("report.html", "summary.md", "junit.xml", "gate.md"):
+        (folder / "run" / name).unlink(missing_ok=True)
+        (folder / "run" / name).symlink_to(target)
+    return [["report", "run"], ["gate", "run"]]
+
+
+def names_in_a_run(folder: Path, bait: Bait) -> list[list[str]]:
+    """Let run.json name a file of the folder as policy, renderer, metric and command."""
+    (folder / "evil.py").write_text(bait.python + "class Evil: pass\n")
+    path = folder / "run" / "run.json"
+    for old, new in (("constant-velocity", "evil.py:Evil"), ('"clean"', '"exec:sh -c $(touch x)"')):
+        path.write_text(path.read_text().replace(old, new))
+    vouch_for(folder / "run")
+    return [["compare", "run"], ["report", "run"], ["view", "run"], ["check", "run"], ["gate", "run"]]
+
+
+def names_in_a_scenario(folder: Path, bait: Bait) -> list[list[str]]:
+    (folder / "evil.py").write_text(bait.python + "class Evil: pass\n")
+    (folder / "scene.yaml").write_text("version: 1\nextends: smoke/straight\npolicy: evil.py:Evil\nrenderer: evil:Evil\n")
+    (folder / "weights.yaml").write_text("version: 1\nextends: evil.py\n")
+    return [["run", "--dry-run", *DRIVE[1:], name] for name in ("scene.yaml", "weights.yaml")]
+
+
+def notebook_and_startup(folder: Path, bait: Bait) -> list[list[str]]:
+    (folder / ".ipython" / "profile_default" / "startup").mkdir(parents=True)
+    (folder / ".ipython" / "profile_default" / "startup" / "00.py").write_text(bait.python)
+    (folder / "matplotlibrc").write_text(f"backend: module://evil\n# {bait.shell}\n")
+    (folder / "evil.py").write_text(bait.python)
+    (folder / "conftest.py").write_text(bait.python)
+    (folder / "setup.cfg").write_text("[options.entry_points]\nsimrun.policies =\n  evil = evil:Evil\n")
+    return [["report", "run"], ["preview", "smoke/straight", "--out", "p.png"]]
+
+
+def shells(folder: Path, bait: Bait) -> list[list[str]]:
+    """Give names that a shell would run."""
+    names = (f"$({bait.shell})", f"; {bait.shell} #", f"`{bait.shell}`", f"| {bait.shell}")
+    commands = [["run", "--dry-run", *DRIVE[1:], name.replace("/", "")] for name in names]
+    return [*commands, ["compare", names[0]], [*DRIVE, "--dry-run", "--policy", f"exec:true {names[1]}", "smoke/straight"]]
+
+
+def programs(folder: Path, bait: Bait) -> list[list[str]]:
+    for name in ("git", "ffmpeg", "nvidia-smi", "sinfo", "sysctl", "ps", "python", "python3", "sh"):
+        (folder / name).write_text(f"#!/bin/sh\n{bait.shell}\n")
+        (folder / name).chmod(0o755)
+    return [["doctor"], [*DRIVE, "--out", "new", "--seeds", "1", "smoke/straight"]]
+
+
+WAYS: dict[str, Way] = {
+    "module of a library that is missing": python_file("colorama.py", "numexpr.py", "coverage.py", "pytz.py", "bottleneck.py"),
+    "module of the standard library": python_file("pickle.py", "selectors.py", "multiprocessing.py", "json.py", "runpy.py"),
+    "package of ours": python_file("alpasim_plugin/__init__.py", "evaluators/__init__.py", "policies/__init__.py", "scenarios/__init__.py"),
+    "sitecustomize": python_file("sitecustomize.py"),
+    "usercustomize": python_file("usercustomize.py"),
+    "__main__ and __init__": python_file("__main__.py", "__init__.py", "run/__init__.py", "run/__main__.py"),
+    "compiled cache": python_file("__pycache__/colorama.cpython-311.pyc", "numba_cache.py"),
+    "distribution metadata and entry points": metadata,
+    "path file": path_file,
+    "git hooks and configuration": git_hooks,
+    "YAML tag": yaml_tags,
+    "pickles in a run folder": pickles_of_a_run,
+    "weights": weights,
+    "object arrays": object_arrays,
+    "archive that leaves its folder": archive_that_leaves_its_folder,
+    "links in a run folder": links,
+    "names in a run folder": names_in_a_run,
+    "names in a scenario": names_in_a_scenario,
+    "start-up files of notebooks, matplotlib and pytest": notebook_and_startup,
+    "words that a shell would run": shells,
+    "programs beside the command": programs,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    assert run_command([*DRIVE, "--policy", "constant-velocity", "--workers", "1", "--out", str(folder / "run"), "smoke/straight"]) == 0
+    return folder / "run"
+
+
+ALL_AT_ONCE = [
+    ["compare", "run"],
+    ["list", "policies"],
+    ["run", "--dry-run", *DRIVE[1:], "smoke/straight"],
+    ["run", "--dry-run", *DRIVE[1:], "scene.yaml"],
+]
+
+
+@pytest.mark.parametrize(
+    "names", [pytest.param(tuple(WAYS), id="all ways at once"), *(pytest.param((name,), id=name, marks=pytest.mark.slow) for name in WAYS)]
+)
+def test_nothing_of_a_strangers_folder_runs(names: tuple[str, ...], finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "stranger"
+    folder.mkdir()
+    subprocess.run(["cp", "-r", str(finished), str(folder / "run")], check=True)
+    assert (folder / "run" / ROLLOUTS_FOLDER).is_dir()
+    bait = Bait(folder, "bait")
+    own = [command for name in names for command in WAYS[name](folder, bait)]
+    for command in own if len(names) == 1 else ALL_AT_ONCE:
+        done = simrun(folder, *command)
+        assert not bait.mark.exists(), f"{command} ran it"
+        assert "Traceback" not in done.stderr, done.stderr
+        assert done.returncode in (0, 1, 2, 3, 4, 5), (command, done.stderr)
+        assert "\x1b" not in done.stderr, "control characters reach the terminal"
+    outside = tmp_path / "not-mine.txt"
+    assert not outside.exists() or outside.read_text() == "mine", "written through a link"
+    assert {path.name for path in tmp_path.iterdir()} <= {"bin", "not-mine.txt", "stranger"}, "written outside of the folder"
+
+
+def test_the_baits_work_where_they_are_run(tmp_path: Path) -> None:
+    bait = Bait(tmp_path / "x", "bait")
+    exec(bait.python)
+    subprocess.run(bait.shell, shell=True, check=True)
+    pickle.loads(pickle.dumps(bait))
+    assert bait.mark.read_text().split() == ["bait"] * 3
+
+
+@pytest.mark.parametrize("text", ["<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "\x1b]0;evil\x07", "\x1b[2J", "\u202eevil"])
+def test_text_of_a_stranger_stays_text(text: str) -> None:
+    from alpasim_plugin.core.errors import InputError
+    from alpasim_plugin.core.escape import markdown, terminal
+
+    said = str(InputError("reading", text, text, text))
+    assert all(part.isprintable() for part in said.splitlines())
+    assert terminal(text).isprintable()
+    assert "<script" not in markdown(text)

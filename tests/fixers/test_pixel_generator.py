@@ -1,0 +1,183 @@
+"""The generator in pixels: cells, sizes from weights, an explicit state, no trace of its grid at the start."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.machine_probe import choose_precision
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, PixelState, hole_mask, pixel_source, sparse_source
+from alpasim_plugin.fixers.network.pixel_layers import Conv3, Dense, Upsample, activation, cells, pack, pixels
+
+SMALL = PixelSizes((8, 12, 16), (1, 0, 2, 1, 1), 8, 4)
+
+
+def network(seed: int = 0, sizes: PixelSizes = SMALL) -> PixelGenerator:
+    torch.manual_seed(seed)
+    return PixelGenerator(sizes).requires_grad_(False)
+
+
+def frames(count: int, seed: int = 1, batch: int = 2) -> list[tuple[Tensor, Tensor, Tensor]]:
+    source = torch.Generator().manual_seed(seed)
+
+    def draw(channels: int) -> Tensor:
+        return torch.rand(batch, 32, 48, channels, generator=source)
+
+    return [(2 * draw(3) - 1, draw(1), 2 * draw(3) - 1) for _ in range(count)]
+
+
+def rolled(net: PixelGenerator, clip: list[tuple[Tensor, Tensor, Tensor]]) -> tuple[list[Tensor], PixelState]:
+    state, out = net.start(clip[0][0]), []
+    for render, opacity, sdmap in clip:
+        made, state = net(render, opacity, sdmap, state)
+        out.append(made)
+    return out, state
+
+
+def test_cells_hold_their_pixels_in_rows_and_come_apart_again() -> None:
+    x = torch.arange(2 * 8 * 12 * 3.0).view(2, 8, 12, 3)
+    packed = cells(x, 4)
+    assert torch.equal(packed[1, 1, 2].view(4, 4, 3), x[1, 4:8, 8:12])
+    assert torch.equal(pixels(packed, 4), x)
+
+
+def test_an_upsampled_cell_starts_flat() -> None:
+    out = Upsample(5, 3)(torch.randn(1, 4, 6, 5))
+    assert out.shape == (1, 8, 12, 3)
+    torch.testing.assert_close(out[:, ::2, ::2], out[:, 1::2, 1::2])
+
+
+@pytest.mark.parametrize(("dtype", "share"), [(torch.float32, 2e-6), (torch.bfloat16, 2**-7)])
+@pytest.mark.parametrize(("inputs", "outputs"), [(5, 3), (48, 24), (160, 160)])
+def test_a_packed_layer_computes_what_it_computed_before(inputs: int, outputs: int, dtype: torch.dtype, share: float) -> None:
+    layers = torch.nn.ModuleList([Conv3(inputs, outputs), Dense(inputs, outputs), Dense(inputs, outputs, bias=False)])
+    layers.requires_grad_(False).to(dtype)
+    conv, dense, bare = layers
+    x = torch.randn(2, 6, 9, inputs, dtype=dtype, generator=torch.Generator().manual_seed(inputs))
+    plain = conv(x), activation(conv(x)), dense(x), bare(x)
+    keys = layers.state_dict().keys()
+    pack(layers)
+    assert layers.state_dict().keys() == keys
+    for one, other in zip((conv(x), conv(x, activated=True), dense(x), bare(x)), plain, strict=True):
+        assert one.stride() == other.stride()
+        torch.testing.assert_close(one, other, rtol=share, atol=share)
+    x[1, 5, 8, 0] = float("nan")
+    assert conv(x, activated=True)[1, 5, 8].isnan().all()
+
+
+def test_weights_say_the_sizes() -> None:
+    net = network()
+    again = PixelGenerator.from_state_dict(net.state_dict())
+    assert again.sizes == SMALL
+    clip = frames(1)
+    assert torch.equal(rolled(again, clip)[0][0], rolled(net, clip)[0][0])
+    plain = network(sizes=PixelSizes((8, 8, 8), hidden=0))
+    assert PixelGenerator.from_state_dict(plain.state_dict()).sizes.hidden == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"refine.bias": None}, "missing: refine.bias"),
+        ({"more.weight": torch.zeros(2)}, "unknown: more.weight"),
+        ({"mix.weight": torch.zeros(8, 8, 1, 1)}, r"mix.weight \[8, 8, 1, 1\] for \[8, 8, 3, 3\]"),
+        ({"mix.bias": torch.full((8,), float("nan"))}, "mix.bias holds 8 values that are not finite"),
+        ({"stem.weight": None}, "no kernel stem.weight"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(change: dict[str, Tensor | None], words: str) -> None:
+    tensors = {key: value for key, value in (network().state_dict() | change).items() if value is not None}
+    with pytest.raises(InputError, match=words):
+        PixelGenerator.from_state_dict(tensors)
+
+
+def test_the_state_is_all_that_goes_on() -> None:
+    net, clip = network(), frames(4)
+    whole, _ = rolled(net, clip)
+    _, after_two = rolled(net, clip[:2])
+    third, _ = net(*clip[2], after_two)
+    assert torch.equal(third, whole[2])
+    other, _ = rolled(net, [*clip[:3], frames(1, seed=9)[0]])
+    assert all(torch.equal(a, b) for a, b in zip(other[:3], whole[:3], strict=True))  # later frames change nothing
+    assert not torch.equal(net(*clip[3], after_two)[0], whole[3])  # and the past is seen
+
+
+def test_attention_reaches_frames_that_the_images_of_the_state_do_not() -> None:
+    sizes = PixelSizes((8, 8, 8), detail=8, hidden=0, memory=2)
+    net = network(sizes=sizes)
+    clip = frames(7)
+    plain = PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=0))
+    plain.load_state_dict({key: value for key, value in net.state_dict().items() if not key.startswith("memory.")})
+    torch.testing.assert_close(
+        rolled(net, clip)[0][6], rolled(plain.requires_grad_(False), clip)[0][6]
+    )  # it begins as if it were not there
+    torch.nn.init.normal_(net.memory.out.weight)  # type: ignore[union-attr]
+    assert PixelGenerator.from_state_dict(net.state_dict()).sizes == sizes
+    whole, state = rolled(net, clip)
+    assert state.frames.flatten().tolist() == [7, 7]
+    assert state.kept.shape == (2, 2, 6, 128)  # of frames 0 and 4
+    forgetful = state.detached()._replace(kept=torch.zeros_like(state.kept))
+    assert not torch.allclose(net(*clip[0], forgetful)[0], net(*clip[0], state)[0])
+    _, early = rolled(net, clip[:3])
+    blank = early._replace(kept=torch.cat([early.kept[:, :1], torch.full_like(early.kept[:, 1:], 9.0)], dim=1))
+    torch.testing.assert_close(net(*clip[3], blank)[0], whole[3])  # slots that nothing has filled yet are not seen
+
+
+def test_clips_of_a_batch_do_not_see_each_other() -> None:
+    net, clip = network(), frames(3)
+    whole, _ = rolled(net, clip)
+    for b in range(2):
+        alone, _ = rolled(net, [tuple(x[b : b + 1] for x in frame) for frame in clip])  # type: ignore[misc]
+        for one, both in zip(alone, whole, strict=True):
+            torch.testing.assert_close(one[0], both[b], atol=2e-6, rtol=0)
+
+
+def test_fresh_clips_start_again_and_others_go_on() -> None:
+    net, clip = network(), frames(2)
+    _, state = rolled(net, clip[:1])
+    mixed = state.restarted(torch.tensor([True, False]), net.start(clip[1][0]))
+    assert torch.equal(mixed.output[0], clip[1][0][0])
+    assert torch.equal(mixed.hidden[1], state.hidden[1])
+    assert not mixed.hidden[0].any()
+
+
+def test_time_one_is_the_deployed_step_and_other_times_differ() -> None:
+    net, (frame,) = network(), frames(1)
+    torch.nn.init.normal_(net.time.weight)
+    state, source = net.start(frame[0]), torch.randn_like(frame[0])
+    deployed, _ = net(*frame, state, source)
+    at_one, _ = net(*frame, state, source, torch.ones(2))
+    torch.testing.assert_close(at_one, deployed, atol=1e-6, rtol=0)
+    assert not torch.allclose(net(*frame, state, source, torch.tensor([1.0, 0.5]))[0][1], deployed[1])
+
+
+def test_noise_enters_holes_alone() -> None:
+    opacity = torch.tensor([0.0, 0.25, 0.5, 0.9, 1.0])
+    assert hole_mask(opacity).tolist() == [0, 0.5, 1, 1, 1]
+    ((render, alpha, _),) = frames(1)
+    eps = torch.randn_like(render)
+    dense = pixel_source(render, alpha, eps)
+    asked: list[int] = []
+
+    def draw(b: int, at: object) -> object:
+        asked.append(len(at))  # type: ignore[arg-type]
+        return eps[b].view(-1, 3)[torch.from_numpy(at)].numpy()  # type: ignore[arg-type]
+
+    torch.testing.assert_close(sparse_source(render, alpha, draw), dense)  # type: ignore[arg-type]
+    assert asked == [int((a < 0.5).sum()) for a in alpha]
+    assert sparse_source(render, torch.ones_like(alpha), draw) is render  # type: ignore[arg-type]
+
+
+def test_half_precision_gives_the_same_picture() -> None:
+    net, clip = network(), frames(6, batch=1)
+    exact, _ = rolled(net, clip)
+    rough, state = rolled(network().to(torch.bfloat16), clip)
+    assert state.output.dtype == torch.float32
+    assert max(float((a - b).abs().max()) for a, b in zip(exact, rough, strict=True)) < 2 / 255
+
+
+def test_the_precision_is_chosen_once_and_says_why() -> None:
+    assert choose_precision("bf16").why == "as set"
+    assert choose_precision("auto", "cuda").name == "bf16"
+    assert choose_precision() == choose_precision()
+    assert "times as fast as float32" in choose_precision().why

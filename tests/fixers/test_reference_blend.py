@@ -1,0 +1,117 @@
+"""What a generator in pixels makes of references: nothing where there is none, the same in any order, and no harm where none holds."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, PixelState
+from alpasim_plugin.fixers.network.reference_blend import _sampled
+from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep, in_floats
+
+SIZES = PixelSizes((16, 16, 16), blend=8)
+HEIGHT, WIDTH = 32, 64
+
+
+def trained_like(seed: int = 0) -> PixelGenerator:
+    """A network none of whose layers is zero, as after training."""
+    net = PixelGenerator.random(SIZES, seed).eval().requires_grad_(False)
+    draw = torch.Generator().manual_seed(seed)
+    assert net.blend is not None
+    for parameter in net.blend.parameters():
+        parameter.add_(0.2 * torch.randn(parameter.shape, generator=draw))
+    return net
+
+
+def inputs(references: int, batch: int = 1, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    render, sdmap = (torch.rand(batch, HEIGHT, WIDTH, 3, generator=draw) * 2 - 1 for _ in range(2))
+    images = torch.rand(batch, references, HEIGHT, WIDTH, 4, generator=draw)
+    images[..., :3] = images[..., :3] * 2 - 1
+    images[..., 3:] = (images[..., 3:] > 0.3).float()
+    return render, torch.ones(batch, HEIGHT, WIDTH, 1), sdmap, images
+
+
+def call(net: PixelGenerator, render: Tensor, opacity: Tensor, sdmap: Tensor, references: Tensor | None) -> tuple[Tensor, PixelState]:
+    out: tuple[Tensor, PixelState] = net(render, opacity, sdmap, net.start(render), None, None, references)
+    return out
+
+
+def test_references_that_hold_nowhere_are_as_good_as_none() -> None:
+    net = trained_like()
+    render, opacity, sdmap, images = inputs(3)
+    images[..., 3] = 0
+    none, state = call(net, render, opacity, sdmap, None)
+    nowhere, _ = call(net, render, opacity, sdmap, images)
+    assert torch.allclose(none, nowhere, atol=1e-3)
+    assert float(state.recorded.max()) == 0
+
+
+def test_the_order_of_references_does_not_matter() -> None:
+    net = trained_like()
+    render, opacity, sdmap, images = inputs(4)
+    one, _ = call(net, render, opacity, sdmap, images)
+    other, _ = call(net, render, opacity, sdmap, images[:, [2, 0, 3, 1]])
+    assert torch.allclose(one, other, atol=1e-5)
+
+
+def test_an_untrained_head_leaves_most_of_the_picture_to_the_generator() -> None:
+    net = PixelGenerator.random(SIZES, 0).eval().requires_grad_(False)
+    render, opacity, sdmap, images = inputs(2)
+    images[..., 3] = 1
+    _, state = call(net, render, opacity, sdmap, images)
+    assert 0 < float(state.recorded.max()) < 0.2
+
+
+@pytest.mark.parametrize(("batch", "references"), [(1, 0), (1, 1), (2, 3)])
+def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None:
+    net = trained_like()
+    render, opacity, sdmap, images = inputs(references, batch)
+    given = (images.abs() * 255).byte() if references else None
+    step = RecordedStep(net, after=1)
+    for _ in range(3):
+        fast, after = step(render, opacity, sdmap, net.start(render), render, given)
+    plain, state = call(net, render, opacity, sdmap, None if given is None else in_floats(given))
+    assert len(step.recorded) == 1
+    # Where a reference ends, an offset that differs by rounding weighs more than the rounding itself.
+    for a, b in ((fast, plain), (after.recorded, state.recorded)):
+        assert float((a - b).abs().quantile(0.99)) < 1e-4
+        assert float((a - b).abs().max()) < 1e-2
+
+
+@pytest.mark.parametrize("references", [0, 2])
+def test_a_network_that_looks_at_smaller_pictures_blends_at_full_size(references: int) -> None:
+    net = trained_like()
+    render, opacity, sdmap, images = inputs(references, 2)
+    given = (images.abs() * 255).byte() if references else None
+    plain, fast = GeneratorStep(net), RecordedStep(net, after=1)
+    start = plain.start(render, 2)
+    assert start.hidden.shape[1] * 2 == net.start(render).hidden.shape[1]
+    assert torch.equal(start.output, render)
+    one, after = plain(render, opacity, sdmap, start, render, given, scale=2)
+    for _ in range(3):
+        other, _ = fast(render, opacity, sdmap, start, render, given, scale=2)
+    assert one.shape == after.render.shape == render.shape
+    assert float((one - other).abs().quantile(0.99)) < 1e-4
+
+    seen = [F.avg_pool2d(x.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1) for x in (render, opacity, sdmap)]
+    if references == 0:  # the change of the render is all there is, and it is enlarged
+        small, _ = call(net, *seen, None)
+        change = F.interpolate((small - seen[0]).permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+        assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
+
+
+def test_sizes_with_a_blending_head_are_read_off_the_tensors() -> None:
+    net = trained_like()
+    assert PixelGenerator.from_state_dict(net.state_dict()).sizes == SIZES
+
+
+def test_offsets_look_up_whole_pixels_exactly_and_the_border_goes_on() -> None:
+    image = torch.rand(1, HEIGHT, WIDTH, 4, generator=torch.Generator().manual_seed(1))
+    offset = torch.zeros(1, HEIGHT // 2, WIDTH // 2, 2)
+    offset[..., 0], offset[..., 1] = 3.0, -2.0
+    moved = _sampled(image, offset)
+    assert torch.allclose(moved[:, 2:, :-3], image[:, :-2, 3:], atol=1e-4)
+    assert torch.allclose(moved[:, 0], moved[:, 1], atol=1e-4)  # the border goes on

@@ -1,0 +1,152 @@
+"""The tables and files of a run folder are what the schema says: in the writer, in the reader, and on the pages."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.core.checksums import SEAL
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.run_folder.columns import RolloutTable
+from alpasim_plugin.log.run_folder.manifests import write_manifest
+from alpasim_plugin.log.run_folder.schema import (
+    ROLLOUT_FILES,
+    ROLLOUTS_TABLE,
+    RUN_FILES,
+    STEPS_TABLE,
+    TableSchema,
+    cell_name,
+    rollout_folder,
+)
+from alpasim_plugin.runs.summary import aggregate_runs
+from evaluators.opening import read_run, read_so_far
+from tests.core.checksum_files import vouch_for
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+ROW = {"renderer": "clean", "policy": "p", "scene": "s", "seed": 0, "status": "ok", "path": "rollouts/x", "wall_s": 1.0, "frames": 3}
+ROWS = [ROW | {"offroad": 0.0, "offroad_valid": True, "seed": seed} for seed in range(3)]
+STEP = {"renderer": "clean", "policy": "p", "scene": "s", "seed": 0, "t_us": 5, "metric": "offroad", "value": 0.0, "valid": True}
+
+
+def changed(column: str, value: Any) -> pa.Table:
+    """Return the rows with another value of a column in the last one, or with another column where ``value`` is a list."""
+    table = pa.Table.from_pylist(ROWS)
+    values = value if isinstance(value, list) else [*table[column].to_pylist()[:-1], value]
+    return table.set_column(table.column_names.index(column), column, pa.array(values))
+
+
+@pytest.mark.parametrize(
+    ("table", "where", "found"),
+    [
+        (changed("offroad", ["a", "b", "c"]), "", "column 'offroad' of string, wanted number"),
+        (changed("offroad", [[0.0], [1.0], [2.0]]), "", "column 'offroad' of list"),
+        (changed("offroad_valid", [1, 1, 1]), "", "column 'offroad_valid' of int64, wanted flag"),
+        (changed("frames", ["3", "3", "3"]), "", "column 'frames' of string, wanted integer"),
+        (changed("path", [1, 2, 3]), "", "column 'path' of int64, wanted text"),
+        (pa.Table.from_pylist(ROWS).drop(["scene"]), "", "no column 'scene'"),
+        (pa.Table.from_pylist(ROWS).drop(["offroad"]), "", "no column 'offroad'"),
+        (changed("scene", None), ", row 2", "column 'scene': nothing, wanted text"),
+        (changed("seed", None), ", row 2", "column 'seed': nothing, wanted integer"),
+        (changed("frames", -1), ", row 2", "column 'frames': a value below 0"),
+        (changed("frames", -(2**63)), ", row 2", "column 'frames': a value below 0"),
+        (changed("wall_s", -0.5), ", row 2", "column 'wall_s': a value below 0"),
+        (changed("offroad", -1e308), ", row 2", "column 'offroad': a value below -1e+15"),
+        (pa.Table.from_pylist([*ROWS, ROWS[0], ROWS[0]]), "", "3 rows of renderer "),
+    ],
+)
+@pytest.mark.parametrize("with_statistics", [True, False])
+def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_row(
+    tmp_path: Path, usual_run: Path, table: pa.Table, where: str, found: str, with_statistics: bool
+) -> None:
+    for name in ("run.json", "summary.json"):
+        shutil.copy(usual_run / name, tmp_path)
+    path = tmp_path / "rollouts.parquet"
+    pq.write_table(table, path, row_group_size=2, write_statistics=with_statistics)
+    for read in (read_run, lambda folder: RolloutTable.of_files([folder / "rollouts.parquet"])):
+        with pytest.raises(InputError) as caught:
+            read(tmp_path)
+        assert caught.value.with_what == f"{path}{where}"
+        assert found in caught.value.found
+        assert caught.value.do_this
+
+
+@pytest.mark.parametrize("value", [-1e14, 1.5])
+def test_a_rate_outside_its_range_is_refused_by_row(tmp_path: Path, usual_run: Path, value: float) -> None:
+    run = shutil.copytree(usual_run, tmp_path / "run")
+    pq.write_table(changed("offroad", value), run / "rollouts.parquet")
+    vouch_for(run)
+    for read in (read_run, lambda folder: aggregate_runs([folder])):
+        with pytest.raises(InputError, match=r"column 'offroad': a value (below 0|above 1)") as caught:
+            read(run)
+        assert caught.value.with_what == f"{run / 'rollouts.parquet'}, row 2"
+
+
+def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(tmp_path: Path, usual_run: Path) -> None:
+    run = vouch_for(shutil.copytree(usual_run, tmp_path / "run"))
+    (run / "contents.json").unlink()
+    for path in run.rglob("manifest.json"):
+        held = json.loads(path.read_text())
+        write_manifest(path.parent, {key: value for key, value in held.items() if key not in (SEAL, "wall_s")})
+    with pytest.raises(InputError, match="manifests from which no table can be made"):
+        read_so_far(run)
+
+
+def test_steps_without_their_time_are_refused_by_row(tmp_path: Path, usual_run: Path) -> None:
+    for name in ("run.json", "summary.json", "rollouts.parquet"):
+        shutil.copy(usual_run / name, tmp_path)
+    pq.write_table(pa.Table.from_pylist([STEP, STEP | {"t_us": None}]), tmp_path / "steps.parquet")
+    with pytest.raises(InputError, match="column 't_us': nothing, wanted integer"):
+        read_run(tmp_path).steps(["offroad"])
+
+
+def test_what_the_schema_writes_it_also_reads(tmp_path: Path) -> None:
+    made = pa.Table.from_pylist(ROWS, schema=ROLLOUTS_TABLE.arrow(["offroad"], of_logs=True))
+    pq.write_table(made, tmp_path / "rollouts.parquet")
+    assert ROLLOUTS_TABLE.read(tmp_path / "rollouts.parquet").equals(made)
+    some = ROLLOUTS_TABLE.read(tmp_path / "rollouts.parquet", only=("seed", "offroad"))
+    assert some.to_pydict() == {"seed": [0, 1, 2], "offroad": [0.0, 0.0, 0.0]}
+
+
+@pytest.mark.parametrize("table", [ROLLOUTS_TABLE, STEPS_TABLE])
+def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(table: TableSchema) -> None:
+    page = (DOCS / "tables.md").read_text()
+    (line,) = [line for line in page.splitlines() if line.startswith(f"| `{table.name}` |")]
+    assert "`rollout`" in page
+    # Names of one kind stand together, followed by the kind in brackets.
+    words = re.findall(r"`(\w+)`|\((text|integer|number|boolean)\)", line)
+    kinds, waiting = {}, []
+    for name, kind in words:
+        if name:
+            waiting.append(name)
+        else:
+            kinds |= dict.fromkeys(waiting, {"boolean": "flag"}.get(kind, kind))
+            waiting = []
+    wanted = {column.name: column.kind for column in table.columns if not column.of_logs}
+    documented = {name: kind for name, kind in kinds.items() if name in wanted}
+    assert documented == wanted
+    assert list(documented) == list(wanted)
+
+
+def test_the_page_of_the_architecture_names_every_file_and_no_other() -> None:
+    page = (DOCS / "architecture.md").read_text()
+    table = page[page.index("| file | content |") :].split("\n\n")[0]
+    first = [line.split("|")[1] for line in table.splitlines()[2:]]
+    named = {name for cell in first for name in re.findall(r"`([^`]+)`", cell)}
+    top = {re.sub(r"/.*", "/", name) for name in named}
+    assert top == {file.name for file in RUN_FILES}
+    inside = next(line for line in table.splitlines() if "rollouts/RENDERER" in line).split("|")[2]
+    assert {name for name in re.findall(r"`([^`]+)`", inside)} == {file.name for file in ROLLOUT_FILES}
+
+
+def test_a_rollout_has_one_folder_and_one_name() -> None:
+    assert rollout_folder("nre://host:50051", "p", "a/b", 3).parts[0] == "rollouts"
+    assert len(rollout_folder("nre://host:50051", "p", "a/b", 3).parts) == 5
+    assert rollout_folder("r", "p", "s", "log 1") != rollout_folder("r", "p", "s", "log-1")
+    assert cell_name("r", "p", "s", 3) == "r/p/s/3"

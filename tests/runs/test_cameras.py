@@ -1,0 +1,67 @@
+"""Frames are rendered only when the policy takes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Rates, Scenario, SensorSpec
+from alpasim_plugin.runs.cameras import CameraRig
+from alpasim_plugin.runs.loop_state import LoopState
+
+
+def rendered_steps(scenario: Scenario, rates: Rates, sensors: list[SensorSpec]) -> list[int]:
+    scenario = replace(scenario, rates=rates)
+    clock = Clock(scenario.start_us, scenario.end_us, rates)
+    rig = CameraRig(scenario, sensors, clock)
+    state = LoopState.at_start(scenario, clock.n_steps)
+    return [tick.step for tick in clock.ticks() if rig.requests(tick, replace_end(state, tick.t_us), {})]
+
+
+def replace_end(state: LoopState, t_us: int):  # type: ignore[no-untyped-def]
+    log = state.scenario.ego_log
+    upto = int(np.searchsorted(log.t_us, t_us, side="right"))
+    return type(log)(log.t_us[:upto], log.xyz[:upto], log.quat[:upto])
+
+
+def test_a_policy_without_cameras_costs_no_frame(straight_road: Scenario) -> None:
+    assert rendered_steps(straight_road, Rates(), []) == []
+
+
+def test_every_frame_but_the_last_is_taken_when_all_rates_agree(straight_road: Scenario) -> None:
+    # No drive follows the last instant, so nobody would look at its frame.
+    assert rendered_steps(straight_road, Rates(), [SensorSpec("front")]) == list(range(30))
+
+
+def test_frames_that_a_slower_policy_never_sees_are_skipped(straight_road: Scenario) -> None:
+    rates = Rates(control_us=100_000, camera_us=100_000, policy_us=500_000)
+    assert rendered_steps(straight_road, rates, [SensorSpec("front")]) == [0, 5, 10, 15, 20, 25]
+
+
+def test_a_slow_camera_is_rendered_at_its_own_times(straight_road: Scenario) -> None:
+    rates = Rates(control_us=100_000, camera_us=300_000, policy_us=100_000)
+    assert rendered_steps(straight_road, rates, [SensorSpec("front")]) == list(range(0, 30, 3))
+
+
+def test_the_sensor_may_ask_for_a_period_of_its_own(straight_road: Scenario) -> None:
+    assert rendered_steps(straight_road, Rates(), [SensorSpec("front", 1_000_000)]) == [0, 10, 20]
+
+
+def test_an_unknown_camera_is_named_with_the_known_ones(straight_road: Scenario) -> None:
+    with pytest.raises(InputError, match=r"needs camera 'rear'; the scenario has \['front'\]"):
+        CameraRig(straight_road, [SensorSpec("rear")], Clock(0, 1_000_000, Rates()))
+
+
+def test_shutter_start_and_end_poses_follow_the_motion(straight_road: Scenario) -> None:
+    camera = replace(straight_road.cameras[0], shutter_us=50_000)
+    scenario = replace(straight_road, cameras=(camera,))
+    clock = Clock(scenario.start_us, scenario.end_us, Rates())
+    rig = CameraRig(scenario, [SensorSpec("front")], clock)
+    tick = list(clock.ticks())[10]
+    (request,) = rig.requests(tick, replace_end(LoopState.at_start(scenario, 30), tick.t_us), {})
+    moved = request.T_world_camera[1, :3, 3] - request.T_world_camera[0, :3, 3]
+    np.testing.assert_allclose(moved, [0.5, 0.0, 0.0], atol=1e-9)

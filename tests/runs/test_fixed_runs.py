@@ -1,0 +1,165 @@
+"""Whole runs with fixers: any number of workers, resume, and what every table says of an untrained fixer."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.runs.cell import MANIFEST
+from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.run import execute_run
+from alpasim_plugin.runs.summary import speed
+from scenarios.suite import expand
+from tests.runs.test_runs import Announced, comparable
+
+pytestmark = pytest.mark.slow
+
+SMALL_NET = ("weights.bundle=null", "dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random")
+SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height: 64}]")
+
+
+def plan_of(fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
+    refs = expand("smoke/straight", SCENE)
+    return make_plan(refs, ("clean", "onefixer-dit-tiny+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer))
+
+
+def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False) -> list[tuple[str, bool]]:
+    announced = Announced()
+    execute_run(plan, root, workers, ["simrun"], announced, resume, "none", report)
+    return announced.results
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_core() -> Iterator[None]:
+    """Keep runs of one worker at one thread: two wait for each other on a busy machine."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    yield
+    os.sched_setaffinity(0, before)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a finished run of one worker."""
+    root = tmp_path_factory.mktemp("run")
+    run(plan_of(), root, report=True)
+    return root
+
+
+@pytest.mark.slow
+def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp_path: Path) -> None:
+    run(plan_of(), tmp_path, workers=2)
+    assert comparable(tmp_path) == comparable(finished)
+    for path in finished.rglob("frames.jsonl"):
+        assert (tmp_path / path.relative_to(finished)).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.slow
+def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path, tmp_path: Path) -> None:
+    plan = plan_of()
+    root = tmp_path / "run"
+    shutil.copytree(finished, root)
+    before = comparable(finished)
+    fixed = next(cell for cell in plan.cells if cell.renderer.name == "onefixer-dit-tiny+clean")
+    (root / fixed.folder / MANIFEST).unlink()
+    assert sorted(run(plan, root)) == [("ok", False), ("ok", True)]
+    assert comparable(root) == before
+    again = run(plan_of(fixer=(*SMALL_NET, "tolerance_m=0")), root, resume=True)
+    assert again == [("ok", True), ("ok", False)]  # the plain renderer's is reused
+
+
+def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
+    said = "untrained (random)"
+    info = json.loads((finished / "run.json").read_text())
+    assert said in info["fixers"]["onefixer-dit-tiny+clean"]["label"]
+    assert info["fixers"]["onefixer-dit-tiny+clean"]["settings"]["dit"]["width"] == 32
+    assert info["config"]["fixer"] == list(SMALL_NET)
+    assert info["weights"] == {}
+    (chosen,) = info["chosen"]["onefixer-dit-tiny+clean"]
+    assert chosen["threads"] == {"number": 1, "why": "one is all there is", "ms": {}}
+    assert (chosen["precision"]["name"], chosen["rollouts"]) == ("fp32", 1)
+    summary = json.loads((finished / "summary.json").read_text())
+    entry = summary["fixers"]["onefixer-dit-tiny+clean"]
+    assert said in entry["label"]
+    assert entry["trained"] is False
+    assert list(summary["fixers"]) == ["onefixer-dit-tiny+clean"]
+    manifest = json.loads(next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/manifest.json")).read_text())
+    assert said in manifest["fixer"]["label"]
+    assert said in (finished / "summary.md").read_text().replace("\\", "")
+    page = (finished / "report.html").read_text()
+    assert '<div class="caution">onefixer-dit-tiny+clean is' in page
+    assert 'id="table-fixers"' in page
+    log = read_asl(next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/rollout.asl")), images=False)
+    assert said in log.info["versions"]["sensorsim"]
+
+
+def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
+    summary = json.loads((finished / "summary.json").read_text())
+    entry = summary["fixers"]["onefixer-dit-tiny+clean"]
+    assert entry["frames"] == 15
+    assert entry["predicted"] == 15 - 3
+    assert 0 < entry["hits"] <= entry["predicted"]
+    assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["predicted"], abs=1e-4)
+    stages = summary["speed"]["onefixer-dit-tiny+clean"]["stages"]
+    assert {"render", "map", "fix", "fix: encode", "fix: dit", "fix: decode", "fix: cache write"} <= set(stages)
+    assert sum(stage["share"] for stage in stages.values()) == pytest.approx(1.0, abs=0.001)
+    steps = pq.read_table(finished / "steps.parquet").to_pylist()
+    shown = [row["value"] for row in steps if row["metric"] == "pose_error_m"]
+    assert len(shown) == entry["frames"]
+    assert max(shown) <= 0.02
+    assert max(shown) == pytest.approx(entry["shown_error"]["camera_m"])
+
+
+def test_a_plain_run_knows_nothing_of_fixers(tmp_path: Path) -> None:
+    plan = make_plan(expand("smoke/straight", SCENE), ("clean",), ("constant-velocity",), (0,), RunOptions())
+    run(plan, tmp_path, report=True)
+    assert json.loads((tmp_path / "summary.json").read_text())["fixers"] == {}
+    assert 'id="fixers"' not in (tmp_path / "report.html").read_text()
+
+
+def test_the_terminal_names_the_fixer_before_and_after(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["--renderer", "identity+clean", "--policy", "lane-camera", "--workers", "1", "--certify", "none", "--out", str(tmp_path)]
+    for text in (*SCENE, "fixer.mode=chunk"):
+        command += ["--set", text]
+    assert run_command([*command, "smoke/straight"]) == 0
+    out = capsys.readouterr()
+    assert "identity+clean: identity, no network, chunk" in out.err
+    assert "identity+clean: identity, no network, chunk" in out.out
+    assert run_command([*command[:2], "--dry-run", "smoke/straight"]) == 0
+    assert "identity+clean: identity, no network, speculative" in capsys.readouterr().out
+
+
+def test_list_fixers_says_whose_weights_they_have(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["list", "fixers", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert "[no network]" in listed["identity"]
+    assert "[weights missing]" in listed["onefixer-2b"]
+    assert set(listed) >= {"onefixer", "onefixer-dit-tiny", "onefixer-dit-s"}
+
+
+def test_time_is_counted_where_it_was_spent() -> None:
+    draft = {"render": [9.0, 6.0, 2.0, 2.0, 6.0, 2.0], "fix": [30.0, 12.0, 0.0, 0.0, 12.0, 0.0]}
+    told = speed([{"frames": 6, "first_call_frames": 1, "stage_ms": draft}])
+    assert told["first_frame_ms"] == 39.0
+    assert told["ms_per_frame_p50"] == 2.0
+    assert told["ms_per_frame_mean"] == pytest.approx(42.0 / 5)
+    assert told["stages"]["fix"] == {"p50_ms": 12.0, "p95_ms": 12.0, "share": round(24 / 42, 4), "per_frame_ms": 4.8}
+
+
+def test_the_frames_of_a_block_share_its_time_and_the_first_block_stands_apart() -> None:
+    blocks = {"render": [100.0] * 5 + [3.0] * 8, "policy": [50.0, 8.0]}
+    told = speed([{"frames": 13, "first_call_frames": 5, "stage_ms": blocks}])
+    assert told["stages"]["render"]["p50_ms"] == 3.0
+    assert told["stages"]["render"]["per_frame_ms"] == 3.0
+    assert told["stages"]["policy"]["p50_ms"] == 8.0

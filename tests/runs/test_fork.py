@@ -1,0 +1,200 @@
+"""Going back into a logged rollout: continue it, or ask at its poses what another renderer would have done."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.core.checksums import SEAL
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.types import SensorSpec
+from alpasim_plugin.log import read_asl, read_facts, write_facts
+from alpasim_plugin.log.run_folder.manifests import write_run_json
+from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.runs.certificate import rollout_trace
+from alpasim_plugin.runs.fork import Change, fork_rollout, merge_sensors
+from alpasim_plugin.runs.logged_rollout import LoggedRollout, find_rollout
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.probe import probe_rollout, write_probe
+from alpasim_plugin.runs.reports import write_flips
+from alpasim_plugin.runs.run import RunResult, execute_run
+from scenarios.suite import expand
+from tests.examples import first_of
+from tests.runs.test_certificate import BARE
+from tests.runs.test_runs import Announced
+
+pytestmark = pytest.mark.slow
+
+SHORT = ("timing.duration_us=1200000", "timing.warmup_us=200000", "degradation.kind=surrogate", *BARE)
+CELL = "clean/lane-camera/smoke-lead_car/0"
+AT_US = 600_000
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a run of a scene with a reactive car ahead behind two renderers, one of which makes the policy lose its lane."""
+    folder = tmp_path_factory.mktemp("run")
+    plan = make_plan(expand("smoke/lead_car", SHORT), ("clean", "broken-frozen"), ("lane-camera",), (0,), RunOptions())
+    execute_run(plan, folder, 1, ["simrun"], Announced(), certificate="none", report=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def past(root: Path) -> LoggedRollout:
+    return find_rollout(root, CELL)
+
+
+@pytest.fixture(scope="module")
+def changed(past: LoggedRollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Continue behind the frozen renderer."""
+    folder = tmp_path_factory.mktemp("changed")
+    go(past, folder, renderer="broken-frozen")
+    return folder
+
+
+def go(past: LoggedRollout, root: Path, **change: object) -> RunResult:
+    return fork_rollout(past, Change(AT_US, **change), root, "none", ["simrun", "fork"])  # type: ignore[arg-type]
+
+
+def forked(root: Path) -> Path:
+    return next(path.parent for path in root.rglob("manifest.json") if "fork" in read_json(path))
+
+
+def test_an_untouched_continuation_is_the_log_to_the_byte(past: LoggedRollout, tmp_path: Path) -> None:
+    go(past, tmp_path)
+    told = read_json(tmp_path / "run.json")["fork"]
+    assert (told["of"], told["replay"], told["continuation"]) == (CELL, "equal", "equal")
+    assert (forked(tmp_path) / "rollout.asl").read_bytes() == (past.folder / "rollout.asl").read_bytes()
+    one, other = rollout_trace(past.folder, past.manifest), rollout_trace(forked(tmp_path), read_json(forked(tmp_path) / "manifest.json"))
+    assert one == other
+
+
+@pytest.mark.slow
+def test_a_stateful_renderer_continues_with_its_history(root: Path, tmp_path: Path) -> None:
+    frozen = find_rollout(root, CELL.replace("clean", "broken-frozen"))
+    go(frozen, tmp_path)
+    assert read_json(tmp_path / "run.json")["fork"]["continuation"] == "equal"
+
+
+@pytest.mark.parametrize("change", first_of([{"policy": "pure-pursuit", "seed": 5}, {}]))
+def test_a_change_takes_effect_at_its_instant_and_not_before(
+    past: LoggedRollout, changed: Path, tmp_path: Path, change: dict[str, object]
+) -> None:
+    if change:
+        go(past, tmp_path, **change)
+    one, other = (read_asl(folder / "rollout.asl") for folder in (past.folder, forked(tmp_path if change else changed)))
+    at_us = past.scenario.start_us + AT_US
+    plans = {plan.now_us: plan.trajectory.xyz for plan in other.plans}
+    same = {plan.now_us: np.array_equal(plan.trajectory.xyz, plans[plan.now_us]) for plan in one.plans}
+    assert all(equal for t_us, equal in same.items() if t_us < at_us)
+    assert not any(equal for t_us, equal in same.items() if t_us > at_us)
+    before = one.ego.t_us <= at_us
+    np.testing.assert_array_equal(one.ego.xyz[before], other.ego.xyz[before])
+    assert not np.array_equal(one.ego.xyz[~before], other.ego.xyz[~before])
+
+
+def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame(past: LoggedRollout, changed: Path) -> None:
+    pixels = {fact["t_us"]: fact["rgb_sha256"] for fact in read_facts(forked(changed) / "frames.jsonl")}
+    first = pixels[past.scenario.start_us]
+    assert [t_us for t_us, digest in pixels.items() if digest == first and t_us > past.scenario.start_us] == [
+        t_us for t_us in pixels if t_us >= past.scenario.start_us + AT_US
+    ]
+
+
+def test_the_run_folder_pairs_the_continuation_with_the_original(past: LoggedRollout, changed: Path) -> None:
+    rows = pq.read_table(changed / "rollouts.parquet").to_pylist()
+    assert [row["renderer"] for row in rows] == ["clean", "broken-frozen from 0.6 s"]
+    here, there = (read_json(folder / "summary.json") for folder in (changed, past.root))
+    assert here["paired"]["broken-frozen from 0.6 s"]["route_distance_m"]["n_cells"] == 1
+    mean = here["metrics"]["clean"]["route_distance_m"]["mean"]
+    assert mean == there["metrics"]["clean"]["route_distance_m"]["mean"]
+    assert "broken-frozen from 0.6 s" in (changed / "report.html").read_text()
+
+
+def test_a_replay_that_leaves_the_log_names_component_and_step(past: LoggedRollout, tmp_path: Path) -> None:
+    copy = tmp_path / "copy" / str(past.manifest["path"])
+    copy.mkdir(parents=True)
+    for file in past.folder.iterdir():
+        (copy / file.name).write_bytes(file.read_bytes())
+    facts = read_facts(copy / "frames.jsonl")
+    facts[3]["rgb_sha256"] = "0" * 16
+    write_facts(copy / "frames.jsonl", facts)
+    moved = replace(past, root=tmp_path / "copy")
+    with pytest.raises(InfrastructureError, match=r"frames at step 3 \(camera front"):
+        go(moved, tmp_path / "out")
+    assert not (tmp_path / "out" / "run.json").exists()
+    with pytest.raises(InfrastructureError, match=r"frames at step 3"):
+        probe_rollout(moved, ["clean", "3dgs"])
+
+
+def test_instants_outside_and_folders_in_use_are_refused(past: LoggedRollout, root: Path, tmp_path: Path) -> None:
+    for after_us in (-1, 1_200_000, 10**12):
+        with pytest.raises(InputError, match=r"the rollout lasts 1\.2 s"):
+            fork_rollout(past, Change(after_us), tmp_path, "none", [])
+    with pytest.raises(InputError, match="it holds a run already"):
+        fork_rollout(past, Change(AT_US), root, "none", [])
+
+
+def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root: Path, past: LoggedRollout) -> None:
+    assert find_rollout(root, str(past.manifest["path"])).cell == past.cell
+    with pytest.raises(InputError, match="no such rollout among its 2") as caught:
+        find_rollout(root, "claen/lane-camera/smoke-lead_car/0")
+    assert CELL in caught.value.do_this
+
+
+def test_a_scenario_that_has_changed_is_refused(root: Path, past: LoggedRollout, tmp_path: Path) -> None:
+    info = read_json(root / "run.json")
+    info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
+    for name in ("rollouts.parquet", str(past.manifest["path"])):
+        copy = shutil.copytree if (root / name).is_dir() else shutil.copy2
+        copy(root / name, tmp_path / name)
+    del info[SEAL]
+    write_run_json(tmp_path, info)
+    with pytest.raises(InputError, match="has changed since the log was written"):
+        find_rollout(tmp_path, CELL)
+
+
+@pytest.mark.slow
+def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(past: LoggedRollout, root: Path) -> None:
+    probe = probe_rollout(past, ["clean", "broken-frozen", "3dgs"])
+    frozen, surrogate = probe.pairs
+    assert len(probe.queries) == 12
+    assert frozen.levels[0] == 0.0  # the first frame is the true one
+    np.testing.assert_array_equal(frozen.gap_m[0], 0.0)
+    assert (frozen.levels[1:] > 0).all()
+    assert frozen.gap_m[-1, 0] > 0.0
+    assert surrogate.levels[0] > 0.0
+    folder = write_probe(probe, past, ("clean", "broken-frozen", "3dgs"))
+    told = read_json(folder / "probe.json")
+    table = pq.read_table(folder / "probe.parquet").to_pylist()
+    assert [row["gap_1s_m"] for row in table[:12]] == frozen.gap_m[:, 0].tolist()
+    assert told["pairs"][0]["gap_1s_m"]["max"] == pytest.approx(np.nanmax(frozen.gap_m[:, 0]), abs=1e-4)
+    assert (folder / "probe.png").stat().st_size > 10_000
+    backwards = probe_rollout(past, ["broken-frozen", "clean"]).pairs[0]
+    np.testing.assert_array_equal(backwards.gap_m, frozen.gap_m)
+    np.testing.assert_allclose(backwards.turn_rad, -frozen.turn_rad, atol=1e-12)
+
+
+def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: LoggedRollout) -> None:
+    with pytest.raises(InputError, match="fewer than two"):
+        probe_rollout(past, ["clean"])
+    blind = replace(past, cell=replace(past.cell, policy=resolve("policy", "pure-pursuit")))
+    with pytest.raises(InputError, match="has no camera"):
+        probe_rollout(blind, ["clean", "3dgs"])
+
+
+def test_two_policies_share_a_camera_at_the_shorter_period() -> None:
+    first, then = (SensorSpec("front"), SensorSpec("left", 200_000)), (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
+    assert merge_sensors(first, then, 100_000) == (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
+
+
+def test_flips_are_written_for_a_run_without_any(root: Path) -> None:
+    told = read_json(write_flips(root))
+    assert told["n_pairs"] == 1
+    assert len(told["cells"]) == told["n_flips"]

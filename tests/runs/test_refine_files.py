@@ -1,0 +1,249 @@
+"""Refining video files: times kept, blocks of the fixer's rule, inputs that do not belong together, memory that does not grow."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.interfaces import BlockRule
+from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.log.video import VideoReader, VideoWriter
+from alpasim_plugin.runs.refine import RefineFiles, refine_video
+
+RATE = Fraction(10)
+
+
+class Inverting:
+    """Returns negatives and remembers what it was given; where the opacity is low it puts the map."""
+
+    trained, label = True, "inverting"
+
+    def __init__(self, rule: BlockRule = BlockRule(5, 8)) -> None:
+        self.blocks = rule
+        self.sizes: list[int] = []
+        self.seen: list[Frame] = []
+
+    def reset(self, seed: int) -> None:
+        self.sizes, self.seen = [], []
+
+    def preview(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        raise AssertionError("a video's blocks are final")
+
+    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        self.sizes.append(len(block))
+        self.seen += block
+        out = []
+        for i, frame in enumerate(block):
+            image = 255 - frame.rgb
+            if frame.alpha is not None and maps:
+                image = np.where(frame.alpha[..., None] < 0.5, maps[i], image)
+            out.append(replace(frame, rgb=image, events=("fixer-black",) if frame.rgb.max() < 3 else ()))
+        return out
+
+
+def pictures(n: int, width: int = 64, height: int = 36) -> list[U8]:
+    x = np.linspace(0, 200, width, dtype=np.float32)
+    return [np.repeat(np.tile(x + i, (height, 1))[..., None], 3, 2).astype(np.uint8) for i in range(n)]
+
+
+def video(
+    path: Path, frames: Sequence[U8], rate: Fraction = RATE, times: Sequence[int] | None = None, base: Fraction | None = None
+) -> Path:
+    with VideoWriter(path, base or 1 / rate, rate, crf=2) as writer:
+        for i, image in enumerate(frames):
+            writer.write(image, i if times is None else times[i])
+    return path
+
+
+def read(path: Path) -> tuple[list[Fraction], U8]:
+    with VideoReader(path) as reader:
+        frames = list(reader)
+        return [f.time * reader.format.time_base for f in frames], np.stack([f.image for f in frames])
+
+
+@pytest.mark.parametrize(("n", "sizes"), [(1, [1]), (5, [5]), (6, [5, 1]), (22, [5, 8, 8, 1])])
+def test_every_length_is_cut_into_the_fixers_blocks(tmp_path: Path, n: int, sizes: list[int]) -> None:
+    fixer = Inverting()
+    given = pictures(n)
+    files = RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4")
+    done: list[tuple[int, int | None]] = []
+    summary = refine_video(files, lambda: fixer, lambda frames, claimed: done.append((frames, claimed)))
+    times, images = read(files.out)
+    assert fixer.sizes == sizes
+    assert done == [(sum(sizes[: i + 1]), n) for i in range(len(sizes))]
+    assert times == [Fraction(i, 10) for i in range(n)]
+    assert np.abs(images.astype(int) - (255 - np.stack(given))).mean() < 2
+    assert summary.frames == n
+    assert summary.psnr_db is not None
+    assert 30 < summary.mean_levels < 120
+    assert [f.t_us for f in fixer.seen] == [i * 100_000 for i in range(n)]
+
+
+def test_variable_frame_times_are_kept(tmp_path: Path) -> None:
+    times = [100, 140, 147, 1600, 1601, 1700]
+    source = video(tmp_path / "in.mp4", pictures(6), times=times, base=Fraction(1, 1000))
+    refine_video(RefineFiles(source, tmp_path / "out.mp4"), Inverting)
+    assert read(tmp_path / "out.mp4")[0] == [Fraction(t, 1000) for t in times]
+
+
+def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path: Path) -> None:
+    given = pictures(7)
+    hole = [np.full_like(given[0], 255) for _ in given]
+    for i, image in enumerate(hole):
+        image[:, : 8 * i] = 0
+    maps = [np.full_like(given[0], 20 * i) for i in range(7)]
+    files = RefineFiles(
+        video(tmp_path / "in.mp4", given),
+        tmp_path / "out.mp4",
+        video(tmp_path / "alpha.mp4", hole),
+        video(tmp_path / "map.mp4", maps),
+        tmp_path / "side.mp4",
+    )
+    refine_video(files, Inverting)
+    _, images = read(files.out)
+    want = [np.where(h < 128, m, 255 - g) for g, h, m in zip(given, hole, maps, strict=True)]
+    assert np.abs(images.astype(int) - np.stack(want)).mean() < 4
+    assert files.compare is not None
+    times, side = read(files.compare)
+    assert times == [Fraction(i, 10) for i in range(7)]
+    assert side.shape == (7, 36, 128, 3)
+    assert np.abs(side[:, :, :64].astype(int) - np.stack(given)).mean() < 2
+    assert np.abs(side[:, :, 64:].astype(int) - images).mean() < 2
+
+
+def test_without_opacity_the_video_counts_as_opaque(tmp_path: Path) -> None:
+    fixer = Inverting()
+    refine_video(RefineFiles(video(tmp_path / "in.mp4", pictures(3)), tmp_path / "out.mp4"), lambda: fixer)
+    assert all(frame.alpha is None for frame in fixer.seen)
+
+
+def test_guard_events_are_counted(tmp_path: Path) -> None:
+    given = pictures(6)
+    given[2] = np.zeros_like(given[2])
+    summary = refine_video(RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4"), Inverting)
+    assert summary.events == {"fixer-black": 1}
+
+
+def test_odd_sizes_are_padded_in_the_file_only(tmp_path: Path) -> None:
+    fixer = Inverting()
+    source = tmp_path / "in.mkv"
+    write_odd(source, pictures(3, 61, 35))
+    summary = refine_video(RefineFiles(source, tmp_path / "out.mp4"), lambda: fixer)
+    assert (summary.width, summary.height) == (61, 35)
+    assert fixer.seen[0].rgb.shape == (35, 61, 3)
+    assert read(tmp_path / "out.mp4")[1].shape == (3, 36, 62, 3)
+
+
+def write_odd(path: Path, frames: Sequence[U8]) -> None:
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = frames[0].shape[1], frames[0].shape[0], "bgr0"
+        for image in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        container.mux(stream.encode())
+
+
+def misfits(folder: Path) -> dict[str, tuple[RefineFiles, str]]:
+    """Return, by situation, files that cannot be refined and what the error must say."""
+    source, out = video(folder / "in.mp4", pictures(9)), folder / "out.mp4"
+    taken = video(folder / "taken.mp4", pictures(1))
+    (folder / "folder.mp4").mkdir()
+    (folder / "link.mp4").symlink_to(source)
+    coloured = [np.stack([p[..., 0], 255 - p[..., 0], p[..., 0]], -1) for p in pictures(9)]
+    side = {
+        "shorter": video(folder / "short.mp4", pictures(8)),
+        "longer": video(folder / "long.mp4", pictures(10)),
+        "larger": video(folder / "large.mp4", pictures(9, 80, 48)),
+        "faster": video(folder / "fast.mp4", pictures(9), Fraction(12)),
+        "late": video(folder / "late.mp4", pictures(9), times=[0, 1, 2, 3, 4, 5, 6, 7, 9]),
+        "coloured": video(folder / "colour.mp4", coloured),
+    }
+    return {
+        "shorter opacity": (RefineFiles(source, out, side["shorter"]), "opacity has 8 frames, the input 9"),
+        "longer map": (RefineFiles(source, out, None, side["longer"]), "sdmap has 10 frames, the input 9"),
+        "larger map": (RefineFiles(source, out, None, side["larger"]), "sdmap is 80x48, the input 64x36"),
+        "faster opacity": (RefineFiles(source, out, side["faster"]), "12.000 frames per second, the input 10.000"),
+        "one frame late": (RefineFiles(source, out, None, side["late"]), "frames per second|frame 8 of the sdmap"),
+        "coloured opacity": (RefineFiles(source, out, side["coloured"]), "opacity is coloured"),
+        "no such input": (RefineFiles(folder / "none.mp4", out), "no such file"),
+        "no such opacity": (RefineFiles(source, out, folder / "none.mp4"), "no such file"),
+        "output exists": (RefineFiles(source, taken), "output exists already"),
+        "comparison exists": (RefineFiles(source, out, compare=taken), "compare exists already"),
+        "output is the input": (RefineFiles(source, source, overwrite=True), "written over the input"),
+        "output is the input by another name": (RefineFiles(source, folder / "link.mp4", overwrite=True), "written over the input"),
+        "output is the map": (RefineFiles(source, taken, None, taken, overwrite=True), "written over the sdmap"),
+        "comparison is the output": (RefineFiles(source, out, compare=out), "written over the output"),
+        "no folder": (RefineFiles(source, folder / "a" / "out.mp4"), "no folder"),
+        "a folder": (RefineFiles(source, folder / "folder.mp4", overwrite=True), "is a folder"),
+        "no MP4": (RefineFiles(source, folder / "out.avi"), "suffix '.avi'"),
+    }
+
+
+SITUATIONS = (
+    "shorter opacity",
+    "longer map",
+    "larger map",
+    "faster opacity",
+    "one frame late",
+    "coloured opacity",
+    "no such input",
+    "no such opacity",
+    "output exists",
+    "comparison exists",
+    "output is the input",
+    "output is the input by another name",
+    "output is the map",
+    "comparison is the output",
+    "no folder",
+    "a folder",
+    "no MP4",
+)
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_files_that_do_not_belong_together_are_refused_and_nothing_is_written(tmp_path: Path, situation: str) -> None:
+    files, found = misfits(tmp_path)[situation]
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=found):
+        refine_video(files, Inverting)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_path: Path) -> None:
+    files = RefineFiles(video(tmp_path / "in.mp4", pictures(20)), tmp_path / "out.mp4", compare=tmp_path / "side.mp4")
+
+    def stop(frames: int, claimed: int | None) -> None:
+        if frames > 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        refine_video(files, Inverting, stop)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
+    assert refine_video(files, Inverting).frames == 20
+
+
+STATM = Path("/proc/self/statm")
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="resident memory is read from /proc")
+def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
+    source, held_mb = tmp_path / "in.mp4", []
+    with VideoWriter(source, 1 / RATE, RATE) as writer:
+        for i in range(240):
+            writer.write(np.full((180, 320, 3), i % 200, np.uint8), i)
+
+    def look(frames: int, claimed: int | None) -> None:
+        held_mb.append(int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6)
+
+    refine_video(RefineFiles(source, tmp_path / "out.mp4"), lambda: make_fixer("identity", scene_id="video"), look)
+    assert held_mb[-1] - held_mb[len(held_mb) // 4] < 15  # holding the 180 frames between would take 31 MB

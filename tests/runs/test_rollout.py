@@ -1,0 +1,213 @@
+"""The loop, with the real renderer, policies, vehicle and log."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin import make_policy, make_renderer, run_rollout
+from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
+from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory
+from alpasim_plugin.core.types import Frame, Latency, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec
+from alpasim_plugin.log.run_folder.schema import LOG_NAME
+from alpasim_plugin.runs.recorder import Recorder
+from tests.examples import first_of
+
+
+def drive(scenario: Scenario, policy: str, renderer: str = "clean", threads: int = 1, seed: int = 0) -> Recorder:
+    session = make_renderer(renderer, scenario, seed, threads=threads)
+    return run_rollout(scenario, session, make_policy(policy, scenario), seed, Recorder(scenario, seed))
+
+
+def digest(recorder: Recorder) -> str:
+    return hashlib.sha256((recorder.folder / LOG_NAME).read_bytes()).hexdigest()
+
+
+def test_log_replay_reproduces_the_recorded_poses(straight_road: Scenario) -> None:
+    log = drive(straight_road, "log-replay").log()
+    rig = offset_trajectory(log.ego, inverse(log.T_rig_box))
+    recorded = interpolate(straight_road.ego_log, rig.t_us)
+    np.testing.assert_allclose(rig.xyz, recorded[:, :3, 3], atol=1e-4)  # poses are float32 in the log
+
+
+def test_a_policy_without_cameras_renders_nothing(straight_road: Scenario) -> None:
+    recorder = drive(straight_road, "log-replay")
+    assert recorder.facts()["frames"] == 0
+    assert "render" not in recorder.facts()["stage_ms"]
+
+
+def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(straight_road: Scenario) -> None:
+    recorder = drive(straight_road, "lane-camera")
+    log = recorder.log()
+    assert len(log.ego) == 31
+    assert len(log.plans) == 30
+    assert len(log.images) == recorder.facts()["frames"] == 30
+    assert [plan.now_us for plan in log.plans] == list(range(0, 3_000_000, 100_000))
+
+
+def test_the_recorded_pose_is_forced_during_the_warm_up_only(straight_road: Scenario) -> None:
+    log = drive(straight_road, "constant-velocity").log()
+    braking = run_rollout(straight_road, make_renderer("clean", straight_road), StandStill(), 0).log()
+    warm = log.ego.t_us <= 1_000_000
+    np.testing.assert_allclose(braking.ego.xyz[warm], log.ego.xyz[warm], atol=1e-4)
+    assert braking.ego.xyz[-1, 0] < log.ego.xyz[-1, 0] - 2.0
+
+
+@pytest.mark.parametrize("renderer", first_of(["3dgs", "clean"]))
+def test_the_same_rollout_twice_is_equal_to_the_byte_for_any_number_of_threads(straight_road: Scenario, renderer: str) -> None:
+    once = digest(drive(straight_road, "lane-camera", renderer, threads=1))
+    assert digest(drive(straight_road, "lane-camera", renderer, threads=2)) == once
+
+
+def test_seeds_change_a_sampling_policy_and_nothing_in_the_warm_up(straight_road: Scenario) -> None:
+    zero, one = (drive(straight_road, "lane-camera", seed=seed).log() for seed in (0, 1))
+    warm = zero.ego.t_us <= 1_000_000
+    np.testing.assert_array_equal(zero.ego.xyz[warm], one.ego.xyz[warm])
+    assert not np.array_equal(zero.ego.xyz[~warm], one.ego.xyz[~warm])
+
+
+class StandStill:
+    """Plans to stay where it is; asks for the camera."""
+
+    sensors = (SensorSpec("front"),)
+
+    def reset(self, seed: int, route: Route) -> None:
+        pass
+
+    def act(self, observation: Observation) -> Plan:
+        times = observation.t_us + np.array([0, 1_000_000, 4_000_000])
+        return Plan(observation.t_us, times, np.zeros((3, 2)), np.zeros(3))
+
+
+class LateBrake(StandStill):
+    """Drives on for a second of questions, then stands still: shows when a plan takes effect."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        if observation.t_us < 1_500_000:
+            along = (plan.times_us - plan.t_us) * 1e-6 * 10.0
+            return replace(plan, xy=np.stack([along, np.zeros(3)], axis=1))
+        return plan
+
+
+def test_a_fixed_latency_delays_the_reaction_by_exactly_that_time(straight_road: Scenario) -> None:
+    def when_braking(latency: Latency) -> int:
+        scenario = replace(straight_road, latency=latency)
+        log = run_rollout(scenario, make_renderer("clean", scenario), LateBrake(), 0).log()
+        speed = np.diff(log.ego.xyz[:, 0]) / 0.1
+        return int(log.ego.t_us[int(np.argmax(speed < 9.5))])
+
+    assert when_braking(Latency("fixed", 300_000)) - when_braking(Latency("none")) == 300_000
+
+
+class Raises(StandStill):
+    """Breaks."""
+
+    def act(self, observation: Observation) -> Plan:
+        raise ValueError("the weights are gone")
+
+
+class NotFinite(StandStill):
+    """Answers NaN."""
+
+    def act(self, observation: Observation) -> Plan:
+        return replace(super().act(observation), yaw=np.full(3, np.nan))
+
+
+class Stale(StandStill):
+    """Answers for an instant that has passed."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        return replace(plan, times_us=plan.times_us - 1)
+
+
+class BareArray(StandStill):
+    """Answers with positions alone."""
+
+    def act(self, observation: Observation) -> Plan:
+        return super().act(observation).xy  # type: ignore[return-value]
+
+
+BROKEN = [
+    (Raises, "ValueError: the weights are gone"),
+    (NotFinite, "not finite"),
+    (Stale, "times_us starts at -1 us"),
+    (BareArray, "act returned a ndarray of shape"),
+]
+
+
+@pytest.mark.parametrize(("policy", "found"), BROKEN)
+def test_a_broken_policy_is_named_and_not_driven(straight_road: Scenario, policy: type[StandStill], found: str) -> None:
+    with pytest.raises(PolicyError, match=found):
+        run_rollout(straight_road, make_renderer("clean", straight_road), policy(), 0)
+
+
+class WrongSize:
+    """Gives frames of another size."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        return Frame(request.t_us, request.camera.name, np.zeros((2, 2, 3), np.uint8))
+
+
+class Breaks:
+    """Raises."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        raise RuntimeError("out of memory")
+
+
+@pytest.mark.parametrize(("renderer", "found"), [(WrongSize, r"uint8 \(2, 2, 3\), not uint8 \(64, 96, 3\)"), (Breaks, "out of memory")])
+def test_a_broken_renderer_is_named_and_its_frame_not_used(straight_road: Scenario, renderer: type, found: str) -> None:
+    with pytest.raises(RendererError, match=found):
+        run_rollout(straight_road, renderer(), StandStill(), 0)
+
+
+class Black:
+    """Gives black frames of the right form."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        return Frame(request.t_us, request.camera.name, np.zeros((request.camera.height, request.camera.width, 3), np.uint8))
+
+
+def test_black_frames_are_counted_not_dropped(straight_road: Scenario) -> None:
+    recorder = run_rollout(straight_road, Black(), StandStill(), 0)
+    assert recorder.facts()["frame_events"] == {"black": 30}
+
+
+def test_a_one_frame_scenario_is_refused(straight_road: Scenario) -> None:
+    with pytest.raises(InputError, match="not a single control step fits"):
+        drive(replace(straight_road, end_us=straight_road.start_us), "log-replay")
+
+
+def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(straight_road: Scenario, tmp_path: Path) -> None:
+    logs, facts = [], []
+    for keep in (False, True):
+        folder = tmp_path / str(keep)
+        folder.mkdir()
+        recorder = Recorder(straight_road, 0, folder, keep_frames=keep)
+        policy = make_policy("log-replay", straight_road)
+        run_rollout(straight_road, make_renderer("clean", straight_road), policy, 0, recorder)
+        recorder.save_pictures(video=keep)
+        logs.append((folder / LOG_NAME).read_bytes())
+        facts.append({key: value for key, value in recorder.facts().items() if key not in ("stage_ms", "strip_t_us")})
+    assert (tmp_path / "True" / "front.mp4").stat().st_size > 1000
+    assert not (tmp_path / "False" / "front.mp4").exists()
+    assert logs[0] == logs[1]
+    assert facts[0] == facts[1]
+
+
+def test_no_actors_at_all_is_a_valid_scene(straight_road: Scenario) -> None:
+    log = drive(replace(straight_road, actors=()), "pure-pursuit").log()
+    assert not log.actors
+
+
+def test_a_failed_rollout_leaves_no_finished_log(straight_road: Scenario, tmp_path: Path) -> None:
+    recorder = Recorder(straight_road, 0, tmp_path)
+    with pytest.raises(PolicyError), recorder:
+        run_rollout(straight_road, make_renderer("clean", straight_road), Raises(), 0, recorder)
+    assert not (tmp_path / LOG_NAME).exists()

@@ -1,0 +1,213 @@
+"""Whole runs: workers, resume, failures, exit codes. Real parts throughout, on the shortest scenes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.run_folder.schema import slug
+from alpasim_plugin.runs.cell import MANIFEST
+from alpasim_plugin.runs.execute import Threads, thread_budget
+from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.run import RunResult, execute_run
+from scenarios.suite import expand
+from tests.runs.grey_renderer import GREY
+
+SHORT = ("timing.duration_us=1200000", "degradation.kind=surrogate")
+
+
+class Announced:
+    """Remembers what a run announced."""
+
+    def __init__(self) -> None:
+        self.results: list[tuple[str, bool]] = []
+        self.notices: list[str] = []
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        self.threads = threads
+
+    def rollout_done(self, manifest: dict, reused: bool) -> None:
+        self.results.append((manifest["status"], reused))
+
+    def noticed(self, text: str) -> None:
+        self.notices.append(text)
+
+
+def plan_of(policies: tuple[str, ...] = ("lane-camera",), scenes: tuple[str, ...] = ("smoke/straight",)) -> RunPlan:
+    refs = [ref for name in scenes for ref in expand(name, SHORT)]
+    return make_plan(refs, ("clean", "3dgs"), policies, (0,), RunOptions())
+
+
+def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
+    """Plan four rollouts a seed that render next to nothing: what is reused does not depend on the renderer."""
+    refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
+    return make_plan(refs, (GREY,), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
+
+
+def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Announced]:
+    announced = Announced()
+    return execute_run(plan, root, workers, ["simrun"], announced, resume, certificate="none", report=False), announced
+
+
+def comparable(root: Path) -> dict[str, object]:
+    """Return everything of a run that must not depend on how it was run."""
+    rows = pq.read_table(root / "rollouts.parquet").drop_columns(["wall_s"]).to_pylist()
+    logs = {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("rollout.asl"))}
+    steps = pq.read_table(root / "steps.parquet").to_pylist()
+    summary = {k: v for k, v in json.loads((root / "summary.json").read_text()).items() if k not in ("speed", "pool", "determinism")}
+    return {"rows": repr(rows), "logs": logs, "steps": repr(steps), "summary": summary}
+
+
+@pytest.mark.parametrize("scenes", [("smoke/straight",), pytest.param(("smoke/straight", "smoke/lead_car"), marks=pytest.mark.slow)])
+@pytest.mark.slow
+def test_one_and_two_workers_give_the_same_run(tmp_path: Path, scenes: tuple[str, ...]) -> None:
+    _, one = run(plan_of(scenes=scenes), tmp_path / "one", workers=1)
+    _, two = run(plan_of(scenes=scenes), tmp_path / "two", workers=2)
+    assert one.results.count(("ok", False)) == two.results.count(("ok", False)) == 2 * len(scenes)
+    assert comparable(tmp_path / "one") == comparable(tmp_path / "two")
+
+
+def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_path: Path) -> None:
+    plan = cheap_plan()
+    run(plan, tmp_path)
+    before = comparable(tmp_path)
+    lost = tmp_path / plan.cells[1].folder / MANIFEST
+    lost.unlink()  # as after a kill: the log is there, the completion marker is not
+    _, announced = run(plan, tmp_path)
+    assert sorted(announced.results) == [("ok", False), ("ok", True), ("ok", True), ("ok", True)]
+    assert comparable(tmp_path) == before
+
+
+@pytest.mark.slow
+def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(tmp_path: Path) -> None:
+    def plan(video: str) -> RunPlan:
+        refs = expand("smoke/straight", ("timing.duration_us=900000",))
+        return make_plan(refs, (GREY,), ("log-replay",), (0,), RunOptions(video=video))  # type: ignore[arg-type]
+
+    run(plan("none"), tmp_path)
+    assert run(plan("all"), tmp_path, resume=True)[1].results == [("ok", False)]
+    assert len(list(tmp_path.rglob("front.mp4"))) == 1
+    assert run(plan("all"), tmp_path)[1].results == [("ok", True)]
+    assert run(plan("failures"), tmp_path, resume=True)[1].results == [("ok", True)]  # no event: nothing is asked for
+
+
+def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
+    run(cheap_plan(), tmp_path)
+    with pytest.raises(InputError, match="it holds another run") as caught:
+        run(cheap_plan((0, 1)), tmp_path)
+    assert "--resume" in caught.value.do_this
+    result, announced = run(cheap_plan((0, 1)), tmp_path, resume=True)
+    assert announced.results.count(("ok", True)) == 4
+    assert result.n_rollouts == 8
+
+
+def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_path: Path) -> None:
+    broken = "tests.runs.broken_policies:Raises"
+    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("constant-velocity", broken), (0, 1), RunOptions())
+    result, _ = run(plan, tmp_path)
+    assert (result.n_rollouts, result.n_failed, result.exit_code) == (4, 2, 2)
+    assert result.summary["failures"]["by_class"] == {"policy": 2}
+    rows = pq.read_table(tmp_path / "rollouts.parquet").to_pylist()
+    assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
+    assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)
+    _, announced = run(plan, tmp_path)
+    assert sorted(announced.results) == [("failed", True), ("failed", True), ("ok", True), ("ok", True)]
+    announced = Announced()
+    execute_run(plan, tmp_path, 1, ["simrun"], announced, certificate="none", report=False, retry=True)
+    assert sorted(announced.results) == [("failed", False), ("failed", False), ("ok", True), ("ok", True)]
+
+
+def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
+    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("tests.runs.broken_policies:MissesItsWeights",), (0,), RunOptions())
+    result, _ = run(plan, tmp_path)
+    assert result.summary["failures"]["cells"][0]["error"]["failure_class"] == "policy"
+    assert run(plan, tmp_path)[1].results == [("failed", False)]  # the file may be there now
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1), marks=pytest.mark.slow)], ids=str)
+def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path, seeds: tuple[int, ...]) -> None:
+    refs = expand("smoke/straight", SHORT)
+    killer = "tests.runs.broken_policies:KillsItsProcess"
+    plan = make_plan(refs, (GREY,), ("constant-velocity", killer, "pure-pursuit"), seeds, RunOptions())
+    result, _ = run(plan, tmp_path, workers=2)
+    assert result.n_failed == len(seeds)
+    assert {cell["policy"] for cell in result.summary["failures"]["cells"]} == {killer}
+    assert result.exit_code == 4
+
+
+@pytest.mark.slow
+def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", "clean", "--policy", "lane-camera", "--seeds", "3"]
+    command += ["--set", SHORT[0], "--workers", "1", "--certify", "none", "--no-report", "--out", str(tmp_path), "smoke/straight"]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+    give_up = time.monotonic() + 90
+    while len(list(tmp_path.rglob(MANIFEST))) < 1 and time.monotonic() < give_up and process.poll() is None:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    done = {path: path.stat().st_mtime_ns for path in tmp_path.rglob(MANIFEST)}
+    assert 1 <= len(done) < 3
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert again.stderr.count("(reused)") == len(done)
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    assert len(list(tmp_path.rglob(MANIFEST))) == 3
+
+
+@pytest.mark.slow
+def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Path) -> None:
+    """A file-size limit stands in for a full disk: the system refuses the same writes with an error of the same kind."""
+    code = (
+        "import resource, sys\n"
+        "from alpasim_plugin.cli.main import run_command\n"
+        "limit = int(sys.argv[1])\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))\n"
+        "sys.exit(run_command(sys.argv[2:]))\n"
+    )
+    common = ["--renderer", "clean", "--policy", "lane-camera", "--workers", "1", "--set", SHORT[0], "--certify", "none", "--resume"]
+    common += ["--out", str(tmp_path)]
+    base = [sys.executable, "-c", code]
+    fine = subprocess.run([*base, str(10**9), "--seeds", "0,1", *common, "smoke/straight"], capture_output=True, text=True)
+    assert fine.returncode == 0, fine.stderr
+    kept = {p: p.read_bytes() for p in tmp_path.rglob("rollout.asl")}
+    full = subprocess.run([*base, "20000", "--seeds", "0,1,2", *common, "smoke/straight"], capture_output=True, text=True)
+    assert full.returncode == 4, full.stderr
+    assert "free disk space" in full.stderr or "File too large" in full.stderr
+    assert {p: p.read_bytes() for p in kept} == kept
+
+
+def test_workers_times_threads_never_exceed_the_cores() -> None:
+    cores = len(os.sched_getaffinity(0))
+    for wanted in (None, 1, 2, 3, 64):
+        for cells in (0, 1, 2, 1000):
+            budget = thread_budget(wanted, cells)
+            assert budget.workers >= 1
+            assert budget.per_worker >= 1
+            assert wanted is not None or budget.workers * budget.per_worker <= max(cores, 1)
+
+
+def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_refused() -> None:
+    refs = [*expand("suites/smoke"), *expand("suites/hard")]  # both list hard/hard_brake
+    plan = make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
+    assert len(refs) == len(plan.cells) + 1
+    refs = [*expand("smoke/straight"), replace(expand("smoke/straight")[0], overrides=("timing.duration_us=2000000",))]
+    with pytest.raises(InputError, match="both have the scene id"):
+        make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
+
+
+def test_names_become_safe_folders_that_never_collide() -> None:
+    assert slug("onefixer@1") == "onefixer@1"
+    assert slug("../../etc").startswith("etc-")
+    assert len({slug(name) for name in ("a/b", "a-b", "a:b", "a b", "", "-")}) == 6
+    assert len(slug("x" * 300)) < 100
+    assert slug("x" * 300) != slug("x" * 299)

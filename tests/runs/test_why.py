@@ -1,0 +1,174 @@
+"""``simrun why``: the page that shows why a drive failed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.run import execute_run
+from evaluators.viewer.cause import failed_at, most_different, said
+from scenarios.suite import expand
+from tests.runs.grey_renderer import GREY
+from tests.runs.test_runs import Announced
+
+HERE = "tests.runs.test_why"
+BEND = """
+version: 1
+description: A bend.
+road: {segments: [{kind: straight, length_m: 12}, {kind: arc, length_m: 60, curvature_per_m: 0.05}]}
+ego: {speed_mps: 9, cruise_mps: 9, max_lateral_accel_mps2: 5}
+environment: {buildings: 0, trees_per_100m: 0, poles_spacing_m: 0}
+cameras: [{width: 64, height: 36}]
+timing: {duration_us: 3_000_000}
+"""
+
+
+class ByRoute:
+    """Follows the route; the sign of its plan is wrong."""
+
+    sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
+
+    def reset(self, seed: int, route: Route) -> None: ...
+
+    def act(self, observation: Observation) -> Plan:
+        ahead = observation.route_rig[np.isfinite(observation.route_rig[:, 0]), :2]
+        ahead = np.concatenate([np.zeros((1, 2)), ahead[ahead[:, 0] > 0.5]])
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ahead, axis=0).T))])
+        times = observation.t_us + 100_000 * np.arange(41, dtype=np.int64)
+        reached = 9e-6 * (times - observation.t_us)
+        xy = np.stack([np.interp(reached, way, ahead[:, k]) for k in (0, 1)], axis=1) * [1.0, -1.0]
+        debug = {
+            "mode": "route",
+            "heat": observation.frames["front"].rgb[::4, ::4, 0].astype(float),
+            "boxes_car": np.array([[4, 5, 20, 15]]),
+        }
+        return Plan(observation.t_us, times, xy, np.arctan2(*np.gradient(xy, axis=0).T[::-1]), debug=debug)
+
+
+class Blind(ByRoute):
+    """Goes straight on."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        x = np.hypot(*plan.xy.T)
+        return replace(plan, xy=np.stack([x, 0 * x], axis=1), yaw=0 * x)
+
+
+class Right(ByRoute):
+    """Follows the route."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        return replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
+
+
+class ByContrast(Right):
+    """Follows the route where a picture shows anything, and loses its way where it is grey."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        return plan if np.ptp(observation.frames["front"].rgb) > 9 else replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a run of the three in a bend."""
+    folder = tmp_path_factory.mktemp("why")
+    (folder / "bend.yaml").write_text(BEND)
+    plan = make_plan(
+        expand(str(folder / "bend.yaml")), (GREY,), tuple(f"{HERE}:{one}" for one in ("ByRoute", "Blind", "Right")), (0,), RunOptions()
+    )
+    execute_run(plan, folder / "run", 1, ["simrun"], Announced(), certificate="none")
+    return folder / "run"
+
+
+def rollout(run: Path, policy: str) -> Path:
+    """Return the folder of a policy's drive."""
+    return next(
+        path.parent for path in run.glob("rollouts/*/*/*/*/manifest.json") if json.loads(path.read_text())["policy"] == f"{HERE}:{policy}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("policy", "words"), [("ByRoute", "left and right are exchanged"), ("Blind", "its plans do not depend on the pictures")]
+)
+def test_a_seeded_fault_is_named(run: Path, policy: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["why", str(rollout(run, policy)), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert any(one["how"] == "shown" and words in one["text"].lower() for one in found["found"]), found
+    assert "not found" not in [one["how"] for one in found["found"]]
+    page = Path(found["page"]).read_text()
+    assert "http" not in page.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
+    assert words in page.lower()
+    assert 'data-key="f"' in page
+    assert 'data-key="w"' not in page  # what was tried is not offered again
+    assert page.count('class="card scroll"') == page.count('class="card scroll" tabindex="0" role="region"')
+
+
+def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bend.yaml").write_text(BEND)
+    plan = make_plan(expand(str(tmp_path / "bend.yaml")), (GREY, "clean"), (f"{HERE}:ByContrast",), (0,), RunOptions())
+    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none")
+    failed = next((tmp_path / "run").glob("rollouts/*/*/*/*/why.html")).parent
+    words = f"Behind clean the same drive ends without an event: the pictures of {GREY} make the difference."
+    assert words in (failed / "why.html").read_text()
+    assert run_command(["why", str(failed), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["found"]
+    assert found[0] == {"how": "shown", "text": words}
+    assert {one["how"] for one in found[1:]} <= {"seen"}, found
+
+
+def test_the_run_writes_a_page_for_what_failed_and_links_it(run: Path) -> None:
+    assert not (rollout(run, "Right") / "why.html").exists()
+    page = (rollout(run, "Blind") / "why.html").relative_to(run).as_posix()
+    assert (run / page).exists()
+    assert page in (run / "report.html").read_text()
+
+
+def test_a_cell_outside_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["why", str(tmp_path / "clean/x/y/0")]) == 2
+    assert "no run folder above it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("side", ["front", "lateral", "rear"])
+def test_a_contact_at_any_side_is_when_a_drive_failed(side: str) -> None:
+    events = [{"metric": "offroad", "t_us": 7}, {"metric": f"collision_{side}", "t_us": 5}, {"metric": "img_is_black", "t_us": 1}]
+    assert failed_at({"events": events}) == 5
+    assert failed_at({"events": events[2:]}) is None
+
+
+def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
+    debug = {
+        "picture": np.zeros((8, 8, 3), np.uint8), "heat": np.eye(6), "boxes_cars": np.array([[0, 0, 10, 20]]),
+        "line_left": np.zeros((5, 2)),
+        "speed": 7.25, "mode": "lane", "weights": [0.1, 0.2], "net": object(), "flat": np.ones((5, 5)), "gaps": np.full((4, 4), np.nan),
+    }  # fmt: skip
+    shown = said(debug, 0.5, lambda xy: xy.tolist())
+    assert [one[0] for one in shown["images"]] == ["picture"]
+    assert [one[0] for one in shown["heat"]] == ["heat", "flat"]
+    assert shown["boxes"] == [["boxes_cars", 0.0, 0.0, 5.0, 10.0]]
+    assert shown["lines"][0][0] == "line_left"
+    assert dict(shown["text"])["speed"] == "7.25"
+    assert dict(shown["text"])["net"] == "not shown: object"
+    assert "not shown" in dict(shown["text"])["gaps"]
+
+
+def test_the_part_that_differs_most_is_found() -> None:
+    one = np.zeros((60, 90, 3), np.uint8)
+    other = one.copy()
+    other[30:45, 50:70] = 200
+    x, y, w, h = most_different(one, other)
+    assert x <= 50
+    assert y <= 30
+    assert x + w >= 70
+    assert y + h >= 45
